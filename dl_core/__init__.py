@@ -1,0 +1,4 @@
+"""LightProbe: HDR environment maps from one photograph, by a chrome ball that a diffusion model paints.
+
+The library under the ComfyUI node pack; it never imports ComfyUI.
+"""

@@ -1,0 +1,190 @@
+"""Where the ball sits on the canvas: fitting the photograph, masks, the depth disc, crop and paste.
+
+Canvas coordinates are continuous, in pixels from the top-left corner: the centre of the first pixel is (0.5, 0.5).
+
+Source: DiffusionLight, Sec. 4 ("we paint a circle both at the depth map's center with the distance closest to the
+camera (visualized as white) and in an inpaint mask").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image as PILImage
+from torch import Tensor
+
+from .errors import ImageError, OptionError
+from .shapes import BallImage, Image, Mask
+
+__all__ = ["Ball", "crop_ball", "disc_mask", "fit_canvas", "paint_depth", "paste_ball", "place_ball"]
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball of whole-pixel size on a canvas.
+
+    Attributes:
+        left: column of the first pixel of its bounding square.
+        top: row of the first pixel of its bounding square.
+        diameter: side of that square, pixels.
+        canvas: side of the square canvas, pixels.
+        dilation: how far the inpaint disc reaches past the ball on each side, pixels (paper's code: 10 of 1024).
+    """
+
+    left: int
+    top: int
+    diameter: int
+    canvas: int
+    dilation: int
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """(x, y) of the centre in canvas coordinates."""
+        return self.left + self.diameter / 2, self.top + self.diameter / 2
+
+
+def place_ball(
+    canvas: int, diameter: int, *, x: float | None = None, y: float | None = None, dilation: int | None = None
+) -> Ball:
+    """Place a ball on a square canvas.
+
+    Args:
+        canvas: side of the canvas in pixels, a multiple of 8.
+        diameter: of the ball in pixels, at least 16.
+        x: column of the centre in canvas coordinates; the middle when not given. Rounded to a whole-pixel square.
+        y: row of the centre; the middle when not given.
+        dilation: pixels the inpaint disc reaches past the ball; the paper's 10 per 1024 pixels when not given.
+
+    Raises:
+        OptionError: the canvas is not a multiple of 8, or the ball does not fit on it.
+    """
+    if canvas < 64 or canvas % 8:
+        raise OptionError("canvas", canvas, "a multiple of 8, at least 64 pixels")
+    if not 16 <= diameter <= canvas:
+        raise OptionError("diameter", diameter, f"16 to {canvas} pixels, the side of the canvas")
+    left = round((canvas / 2 if x is None else x) - diameter / 2)
+    top = round((canvas / 2 if y is None else y) - diameter / 2)
+    for name, value, start in (("x", x, left), ("y", y, top)):
+        if not 0 <= start <= canvas - diameter:
+            raise OptionError(
+                name, value, f"{diameter / 2:g} to {canvas - diameter / 2:g}, so that the ball is on the canvas"
+            )
+    if dilation is None:
+        dilation = max(1, round(canvas * 10 / 1024))
+    if not 0 <= dilation <= canvas // 2:
+        raise OptionError("dilation", dilation, f"0 to {canvas // 2} pixels")
+    return Ball(left, top, diameter, canvas, dilation)
+
+
+def fit_canvas(image_ldr: Image, canvas: int) -> Image:
+    """Fit a photograph into a square canvas, keeping its aspect, with black bars (Lanczos, as the authors' code).
+
+    Args:
+        image_ldr: (B, H, W, 3) display-encoded in [0, 1].
+        canvas: side of the canvas in pixels.
+
+    Returns:
+        (B, canvas, canvas, 3) in [0, 1].
+
+    Raises:
+        ImageError: an empty picture.
+    """
+    height, width = image_ldr.shape[1:3]
+    if height < 1 or width < 1:
+        raise ImageError("image", f"is empty ({width} x {height})")
+    scale = canvas / max(height, width)
+    fitted_height, fitted_width = (max(1, round(side * scale)) for side in (height, width))
+    result = torch.zeros(image_ldr.shape[0], canvas, canvas, image_ldr.shape[3])
+    top, left = (canvas - fitted_height) // 2, (canvas - fitted_width) // 2
+    resized = _lanczos(image_ldr, fitted_height, fitted_width)
+    result[:, top : top + fitted_height, left : left + fitted_width] = resized.clamp(0, 1)
+    return result.to(image_ldr.device)
+
+
+def _lanczos(image: Image, height: int, width: int) -> Image:
+    """Resize in float: Pillow resamples one plane of 32-bit values at a time."""
+    planes = image.permute(0, 3, 1, 2).detach().cpu().float().numpy()
+    resized = [
+        [np.asarray(PILImage.fromarray(plane).resize((width, height), PILImage.Resampling.LANCZOS)) for plane in item]
+        for item in planes
+    ]
+    return torch.from_numpy(np.array(resized)).permute(0, 2, 3, 1)
+
+
+def disc_mask(ball: Ball, *, grow: float = 0.0) -> Mask:
+    """Hard disc on the canvas: 1 where a pixel's centre lies within the ball's radius plus `grow` pixels.
+
+    Returns:
+        (1, canvas, canvas).
+    """
+    x, y = ball.centre
+    positions = torch.arange(ball.canvas) + 0.5
+    squared = (positions[None, :] - x) ** 2 + (positions[:, None] - y) ** 2
+    return (squared <= (ball.diameter / 2 + grow) ** 2).float()[None]
+
+
+def paint_depth(depth: Image | None, ball: Ball) -> Image:
+    """Paint the ball nearest (white) on a depth map for a depth ControlNet.
+
+    Args:
+        depth: (B, H, W, 1 or 3), near is bright; it is fitted to the canvas and stretched to [0, 1] as the authors'
+            code does. Without one the scene is taken as far away (black).
+        ball: where the ball goes.
+
+    Returns:
+        (B, canvas, canvas, 3) in [0, 1].
+
+    Raises:
+        ImageError: depth that is not finite.
+    """
+    if depth is None:
+        fitted = torch.zeros(1, ball.canvas, ball.canvas, 1)
+    else:
+        if not torch.isfinite(depth).all():
+            raise ImageError("depth", "holds NaN or infinite values")
+        plane = depth.float().mean(dim=-1, keepdim=True)
+        low, high = plane.amin(dim=(1, 2, 3), keepdim=True), plane.amax(dim=(1, 2, 3), keepdim=True)
+        fitted = fit_canvas((plane - low) / (high - low).clamp(min=1e-8), ball.canvas)
+    disc = disc_mask(ball)[..., None].to(fitted)
+    return (fitted * (1 - disc) + disc).expand(-1, -1, -1, 3).contiguous()
+
+
+def crop_ball(image: Image, ball: Ball) -> BallImage:
+    """Cut the ball's bounding square out of canvas images: (B, canvas, canvas, C) -> (B, diameter, diameter, C)."""
+    return image[:, ball.top : ball.top + ball.diameter, ball.left : ball.left + ball.diameter]
+
+
+def paste_ball(image: Image, crop: BallImage, ball: Ball) -> Image:
+    """Paste a ball crop on canvas images through the hard disc (paper, Algorithm 1, line 12).
+
+    Args:
+        image: (B, canvas, canvas, C).
+        crop: (B or 1, diameter, diameter, C).
+        ball: where it goes.
+
+    Returns:
+        A new (B, canvas, canvas, C); the input is left as it was.
+    """
+    disc = crop_ball(disc_mask(ball)[..., None], ball).to(image)
+    result = image.clone()
+    window = crop_ball(result, ball)
+    window.copy_(window * (1 - disc) + crop.to(image) * disc)
+    return result
+
+
+def require_canvas(image: Image, ball: Ball) -> Float[Tensor, "b h w c"]:
+    """The image, if it is a square canvas of the ball's size.
+
+    Raises:
+        ImageError: another size.
+    """
+    if image.shape[1:3] != (ball.canvas, ball.canvas):
+        raise ImageError(
+            "image",
+            f"is {image.shape[2]} x {image.shape[1]} pixels, the ball was placed on {ball.canvas} x {ball.canvas}; "
+            "connect the canvas image that came with the ball",
+        )
+    return image

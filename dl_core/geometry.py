@@ -1,0 +1,399 @@
+"""Directions, latlong maps and mirror balls, and resampling between them.
+
+World: +X is right of the photograph, +Y up, and the camera looks along -Z (the viewer sits at +Z).
+
+Latlong (height H, width 2H): pixel (i, j) has its centre at v = (i + 0.5) / H, u = (j + 0.5) / (2H). Row 0 is up,
+the centre of the map looks along -Z, and what is right of the photograph is right of the centre.
+
+Mirror ball, orthographic: the disc point (x, y) has the normal n = (x, y, sqrt(1 - x² - y²)) and reflects
+r = 2 (n·v) n - v with v = +Z. The map is equal-area: dω = 4 dx dy, so every pixel of a ball of radius R pixels
+covers 4 / R² sr. The centre reflects what is behind the camera; the whole rim is one direction, straight ahead.
+
+Resampling averages several bilinear samples spread over each output pixel, weighted by solid angle, which is what
+keeps energy: a single sample aliases wherever the footprint of an output pixel is long and thin (near the rim).
+
+Source: DiffusionLight, Sec. 4 and Fig. 3; the equal-area property follows from dω = 4 cos θ dA for a unit sphere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from .errors import OptionError
+from .shapes import BallImage, Directions, Disc, Image, Latlong
+
+__all__ = [
+    "ball_coverage",
+    "ball_directions",
+    "ball_solid_angle",
+    "ball_to_latlong",
+    "camera_rotation",
+    "disc_coordinates",
+    "disc_directions",
+    "latlong_coordinates",
+    "latlong_directions",
+    "latlong_energy",
+    "latlong_solid_angles",
+    "latlong_to_ball",
+    "latlong_to_perspective",
+    "rotate_latlong",
+    "sample_latlong",
+]
+
+
+def _require_latlong(latlong: Tensor) -> None:
+    if latlong.ndim != 4 or latlong.shape[2] != 2 * latlong.shape[1]:
+        raise OptionError("latlong", tuple(latlong.shape), "shape (batch, height, 2 x height, channels)")
+
+
+def _require_samples(samples: int) -> None:
+    if not 1 <= samples <= 64:
+        raise OptionError("samples", samples, "1 to 64 samples along each side of a pixel")
+
+
+def _subpixels(count: int, samples: int, device: torch.device | None = None) -> Float[Tensor, "n"]:
+    """Positions, in pixels, of `samples` evenly spread samples in each of `count` pixels."""
+    return (torch.arange(count * samples, device=device, dtype=torch.float32) + 0.5) / samples
+
+
+# --- latlong -----------------------------------------------------------------------------------------------------
+
+
+def _spherical(u: Tensor, v: Tensor) -> Directions:
+    """Unit vectors for map coordinates u (across) and v (down), both in [0, 1]."""
+    azimuth = (u - 0.5) * (2 * math.pi)
+    polar = v * math.pi
+    sin_polar = torch.sin(polar)
+    return torch.stack((sin_polar * torch.sin(azimuth), torch.cos(polar), -sin_polar * torch.cos(azimuth)), dim=-1)
+
+
+def latlong_directions(height: int, *, device: torch.device | None = None) -> Float[Tensor, "h w 3"]:
+    """Directions of the pixel centres of a latlong map.
+
+    Args:
+        height: rows of the map, at least 1; its width is twice that.
+        device: where to build the tensor.
+
+    Returns:
+        (height, 2 height, 3) unit vectors.
+
+    Raises:
+        OptionError: height below 1.
+    """
+    if height < 1:
+        raise OptionError("height", height, "1 or more rows")
+    v = _subpixels(height, 1, device) / height
+    u = _subpixels(2 * height, 1, device) / (2 * height)
+    return _spherical(u[None, :].expand(height, -1), v[:, None].expand(-1, 2 * height))
+
+
+def latlong_coordinates(directions: Directions) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+    """Map coordinates (u, v) in [0, 1] of directions: the inverse of the latlong convention.
+
+    Straight up and straight down have no azimuth; they get that of straight ahead.
+
+    Args:
+        directions: (..., 3), of any length above zero.
+    """
+    x, y, z = directions.unbind(-1)
+    u = torch.atan2(x, -z) / (2 * math.pi) + 0.5
+    v = torch.atan2(torch.hypot(x, z), y) / math.pi
+    return u, v
+
+
+def latlong_solid_angles(height: int, *, device: torch.device | None = None) -> Float[Tensor, "h 1"]:
+    """Exact solid angle of a pixel in each row, in steradians; all pixels together cover 4π.
+
+    Returns:
+        (height, 1): a column that broadcasts over the row.
+    """
+    edges = torch.arange(height + 1, device=device, dtype=torch.float64) * (math.pi / height)
+    bands = torch.cos(edges[:-1]) - torch.cos(edges[1:])
+    return (bands * (math.pi / height)).float()[:, None]
+
+
+def latlong_energy(latlong: Latlong) -> Float[Tensor, "b c"]:
+    """Radiance integrated over the sphere, per image and channel (radiance x sr)."""
+    _require_latlong(latlong)
+    weights = latlong_solid_angles(latlong.shape[1], device=latlong.device)
+    return (latlong.double() * weights[None, :, :, None]).sum(dim=(1, 2)).to(latlong.dtype)
+
+
+def _pad_sphere(latlong: Latlong) -> Latlong:
+    """Add one pixel on each side: around the seam, and over the poles (half a turn away)."""
+    half = latlong.shape[2] // 2
+    over_north = torch.roll(latlong[:, :1], half, dims=2)
+    over_south = torch.roll(latlong[:, -1:], half, dims=2)
+    tall = torch.cat((over_north, latlong, over_south), dim=1)
+    return torch.cat((tall[:, :, -1:], tall, tall[:, :, :1]), dim=2)
+
+
+def _bilinear(image: Image, columns: Tensor, rows: Tensor) -> Float[Tensor, "b *n c"]:
+    """Sample at continuous pixel positions (0.5 is the centre of the first pixel); edges are held."""
+    height, width = image.shape[1:3]
+    grid = torch.stack((columns * (2 / width) - 1, rows * (2 / height) - 1), dim=-1)
+    flat = grid.reshape(1, 1, -1, 2).expand(image.shape[0], -1, -1, -1)
+    values = F.grid_sample(
+        image.permute(0, 3, 1, 2), flat.to(image.dtype), mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return values[:, :, 0].permute(0, 2, 1).reshape(image.shape[0], *columns.shape, image.shape[3])
+
+
+def sample_latlong(latlong: Latlong, directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "b *n c"]:
+    """Bilinear values of a map in given directions, without a line at the seam or the poles.
+
+    Args:
+        latlong: (B, H, 2H, C), display-encoded or linear: values are interpolated as they are.
+        directions: (..., 3), the same for every map of the batch.
+    """
+    _require_latlong(latlong)
+    u, v = latlong_coordinates(directions)
+    height, width = latlong.shape[1:3]
+    return _bilinear(_pad_sphere(latlong), u * width + 1, v * height + 1)
+
+
+def rotate_latlong(latlong: Latlong, rotation: Float[Tensor, "3 3"], *, samples: int = 2) -> Latlong:
+    """Turn the world: the light from direction d comes from `rotation @ d` afterwards."""
+    height = latlong.shape[1]
+    inverse = rotation.to(latlong).T
+
+    def look_up(directions: Tensor) -> Tensor:
+        return sample_latlong(latlong, directions @ inverse.T)
+
+    return _gather_latlong(look_up, height, samples, latlong.device)
+
+
+def _gather_latlong(look_up: Callable[[Tensor], Tensor], height: int, samples: int, device: torch.device) -> Latlong:
+    """Average `look_up(directions)` over each pixel of a map, weighted by solid angle. Row strips bound memory."""
+    _require_samples(samples)
+    rows_per_strip = max(1, (1 << 20) // (2 * height * samples * samples))
+    v = _subpixels(height, samples, device) / height
+    u = _subpixels(2 * height, samples, device) / (2 * height)
+    strips = []
+    for strip in v.split(rows_per_strip * samples):
+        directions = _spherical(u[None, :].expand(len(strip), -1), strip[:, None].expand(-1, len(u)))
+        values = look_up(directions)
+        weights = torch.sin(strip * math.pi).view(1, -1, samples, 1, 1, 1).to(values)
+        blocks = values.reshape(values.shape[0], len(strip) // samples, samples, 2 * height, samples, values.shape[-1])
+        weighted = (blocks * weights).sum(dim=(2, 4))
+        strips.append(weighted / (weights.sum(dim=2).squeeze(2) * samples))
+    return torch.cat(strips, dim=1)
+
+
+# --- mirror ball -------------------------------------------------------------------------------------------------
+
+
+def disc_directions(disc: Disc) -> Directions:
+    """Directions reflected to an orthographic viewer at +Z by the points of a unit mirror ball's disc.
+
+    Args:
+        disc: (..., 2), x right and y up, with x² + y² <= 1; points outside reflect as the rim does.
+    """
+    x, y = disc.unbind(-1)
+    squared = (x * x + y * y).clamp(max=1)
+    twice_normal_z = 2 * torch.sqrt(1 - squared)
+    return torch.stack((twice_normal_z * x, twice_normal_z * y, 1 - 2 * squared), dim=-1)
+
+
+def disc_coordinates(directions: Directions) -> Disc:
+    """Where on the unit disc a direction is reflected: the inverse of `disc_directions`.
+
+    Straight ahead (0, 0, -1) is the whole rim; it gets the rim's rightmost point.
+
+    Args:
+        directions: (..., 3) unit vectors.
+    """
+    x, y, z = directions.unbind(-1)
+    transverse = torch.hypot(x, y)
+    # sqrt((1 - z) / 2) loses its digits near the centre, transverse / sqrt(2 + 2z) near the rim.
+    radius = torch.where(z > 0, transverse / torch.sqrt(2 + 2 * z.clamp(min=0)), torch.sqrt((1 - z).clamp(min=0) / 2))
+    on_axis = transverse == 0
+    scale = radius / torch.where(on_axis, torch.ones_like(transverse), transverse)
+    return torch.stack((torch.where(on_axis, radius, scale * x), scale * y), dim=-1)
+
+
+def ball_solid_angle(radius: float) -> float:
+    """Solid angle, in steradians, that each pixel of a ball of `radius` pixels reflects."""
+    return 4 / radius**2
+
+
+def ball_directions(
+    size: int, *, radius: float | None = None, device: torch.device | None = None
+) -> Float[Tensor, "d d 3"]:
+    """Directions reflected by the pixel centres of a square ball crop; pixels off the ball reflect as the rim does.
+
+    Args:
+        size: side of the crop in pixels; the ball is centred in it.
+        radius: of the ball in pixels; half the crop when not given.
+        device: where to build the tensor.
+    """
+    positions = _subpixels(size, 1, device)
+    return disc_directions(
+        _crop_disc(positions, positions, size / 2 if radius is None else radius, (size / 2, size / 2))
+    )
+
+
+def ball_coverage(
+    size: int, *, radius: float | None = None, samples: int = 8, device: torch.device | None = None
+) -> Float[Tensor, "d d"]:
+    """How much of each pixel of a square crop the ball covers, 0 to 1.
+
+    The energy of a ball image is the sum of radiance x coverage x `ball_solid_angle(radius)`.
+    """
+    _require_samples(samples)
+    positions = _subpixels(size, samples, device)
+    disc = _crop_disc(positions, positions, size / 2 if radius is None else radius, (size / 2, size / 2))
+    return (disc.square().sum(-1) <= 1).float().reshape(size, samples, size, samples).mean(dim=(1, 3))
+
+
+def _crop_disc(columns: Tensor, rows: Tensor, radius: float, centre: tuple[float, float]) -> Float[Tensor, "r c 2"]:
+    """Disc coordinates of a grid of pixel positions in a crop; longer than 1 outside the ball."""
+    if radius <= 0:
+        raise OptionError("radius", radius, "a radius above 0 pixels")
+    x = (columns - centre[0]) / radius
+    y = (centre[1] - rows) / radius
+    return torch.stack((x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x))), dim=-1)
+
+
+def latlong_to_ball(latlong: Latlong, size: int, *, radius: float | None = None, samples: int = 4) -> BallImage:
+    """The mirror ball that an orthographic viewer sees in the light of a map.
+
+    Args:
+        latlong: (B, H, 2H, C), normally linear radiance.
+        size: side of the square crop in pixels; the ball is centred in it.
+        radius: of the ball in pixels; half the crop when not given.
+        samples: samples along each side of a pixel. Those of a rim pixel that miss the ball do not count.
+
+    Returns:
+        (B, size, size, C); zero outside the ball.
+
+    Raises:
+        OptionError: a map that is not 2:1, or samples outside 1 to 64.
+
+    Source: DiffusionLight, Sec. 4.2 (training pairs: a chrome ball rendered from a panorama).
+    """
+    _require_latlong(latlong)
+    _require_samples(samples)
+    radius = size / 2 if radius is None else radius
+    positions = _subpixels(size, samples, latlong.device)
+    strips = []
+    for strip in positions.split(max(1, (1 << 20) // (size * samples * samples)) * samples):
+        disc = _crop_disc(positions, strip, radius, (size / 2, size / 2))
+        on_ball = (disc.square().sum(-1) <= 1).to(latlong)
+        values = sample_latlong(latlong, disc_directions(disc)) * on_ball[..., None]
+        shape = (len(strip) // samples, samples, size, samples)
+        total = values.reshape(values.shape[0], *shape, values.shape[-1]).sum(dim=(2, 4))
+        counted = on_ball.reshape(shape).sum(dim=(1, 3)).clamp(min=1)
+        strips.append(total / counted[None, :, :, None])
+    return torch.cat(strips, dim=1)
+
+
+def ball_to_latlong(
+    ball: BallImage,
+    height: int,
+    *,
+    radius: float | None = None,
+    centre: tuple[float, float] | None = None,
+    samples: int = 4,
+) -> Latlong:
+    """Unwrap an orthographic mirror ball to a latlong map.
+
+    Args:
+        ball: (B, D, D, C), linear or display-encoded: values are interpolated as they are.
+        height: rows of the map; its width is twice that.
+        radius: of the ball in pixels; D / 2 when not given. Half a pixel too much or too little moves a light that
+            stands 20 degrees from straight ahead by 2.8 degrees (for D = 256).
+        centre: (x, y) of the ball in the crop, in pixels from its top-left corner; the middle when not given.
+        samples: samples along each side of a pixel of the map.
+
+    Returns:
+        (B, height, 2 height, C).
+
+    Raises:
+        OptionError: a crop that is not square, a radius not above 0, or samples outside 1 to 64.
+
+    Source: DiffusionLight, Sec. 4 ("unwrapped to an environment map").
+    """
+    if ball.ndim != 4 or ball.shape[1] != ball.shape[2]:
+        raise OptionError("ball", tuple(ball.shape), "shape (batch, side, side, channels)")
+    size = ball.shape[1]
+    radius = size / 2 if radius is None else radius
+    centre = (size / 2, size / 2) if centre is None else centre
+    positions = _subpixels(size, 1, ball.device)
+    inside = _crop_disc(positions, positions, radius, centre).square().sum(-1) <= 1
+    coverage = inside.to(ball)[None, :, :, None]
+    # Beside the rim a bilinear sample reaches past the ball: weigh what is on it and leave the rest out.
+    weighted = torch.cat((ball * coverage, coverage.expand(ball.shape[0], -1, -1, -1)), dim=-1)
+
+    def reflect(directions: Tensor) -> Tensor:
+        inner = _within(disc_coordinates(directions), 1 - 0.5 / max(radius, 1.0))
+        values = _bilinear(weighted, centre[0] + radius * inner[..., 0], centre[1] - radius * inner[..., 1])
+        return values[..., :-1] / values[..., -1:].clamp(min=1e-6)
+
+    return _gather_latlong(reflect, height, samples, ball.device)
+
+
+def _within(disc: Disc, limit: float) -> Disc:
+    """Pull points beyond `limit` of the radius back to it: the outermost half pixel holds no sample of its own."""
+    length = torch.linalg.norm(disc, dim=-1, keepdim=True)
+    return disc * (limit / length.clamp(min=limit))
+
+
+# --- camera ------------------------------------------------------------------------------------------------------
+
+
+def camera_rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Float[Tensor, "3 3"]:
+    """Rotation from camera to world axes.
+
+    Args:
+        yaw: degrees to the right.
+        pitch: degrees up.
+        roll: degrees clockwise, as the photographer turns the camera.
+    """
+    y, p, r = (math.radians(angle) for angle in (-yaw, pitch, -roll))
+    about_y = torch.tensor([[math.cos(y), 0, math.sin(y)], [0, 1, 0], [-math.sin(y), 0, math.cos(y)]])
+    about_x = torch.tensor([[1, 0, 0], [0, math.cos(p), -math.sin(p)], [0, math.sin(p), math.cos(p)]])
+    about_z = torch.tensor([[math.cos(r), -math.sin(r), 0], [math.sin(r), math.cos(r), 0], [0, 0, 1]])
+    return about_y @ about_x @ about_z
+
+
+def latlong_to_perspective(
+    latlong: Latlong,
+    height: int,
+    width: int,
+    *,
+    fov: float = 60.0,
+    rotation: Float[Tensor, "3 3"] | None = None,
+    samples: int = 2,
+) -> Image:
+    """What a pinhole camera sees of a map.
+
+    Args:
+        latlong: (B, H, 2H, C).
+        height: rows of the picture.
+        width: columns of the picture.
+        fov: field of view across the longer side, degrees, 1 to 179.
+        rotation: camera to world, as from `camera_rotation`; straight ahead when not given.
+        samples: samples along each side of a pixel.
+
+    Raises:
+        OptionError: field of view or samples out of range.
+    """
+    if not 1 <= fov <= 179:
+        raise OptionError("fov", fov, "1 to 179 degrees")
+    _require_samples(samples)
+    extent = math.tan(math.radians(fov) / 2) * 2 / max(height, width)
+    x = (_subpixels(width, samples, latlong.device) - width / 2) * extent
+    y = (height / 2 - _subpixels(height, samples, latlong.device)) * extent
+    rays = torch.stack((x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x)), -torch.ones(len(y), len(x))), -1)
+    if rotation is not None:
+        rays = rays @ rotation.to(rays).T
+    values = sample_latlong(latlong, rays)
+    blocks = values.reshape(values.shape[0], height, samples, width, samples, values.shape[-1])
+    return blocks.mean(dim=(2, 4))

@@ -1,0 +1,54 @@
+"""Presets: named points between speed and accuracy. One table, read by the command line and the nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from .errors import OptionError
+from .iterative import Rounds
+
+__all__ = ["PRESETS", "Preset", "preset"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A schedule and the bracket it paints.
+
+    Attributes:
+        rounds: schedule of iterative inpainting at each EV.
+        evs: exposure values, descending from 0.
+        summary: one line for people.
+    """
+
+    rounds: Rounds
+    evs: tuple[float, ...]
+    summary: str
+
+    @property
+    def guided_steps(self) -> int:
+        """Denoising steps over all exposures; each costs two denoiser evaluations with guidance."""
+        r = self.rounds
+        later = int(r.steps * r.strength)
+        each = r.steps if r.rounds == 0 else r.balls * (r.steps + later * (r.rounds - 1)) + later * r.final
+        return each * len(self.evs)
+
+
+PAPER_EVS: Final = (0.0, -2.5, -5.0)
+
+PRESETS: Final[dict[str, Preset]] = {
+    "draft": Preset(Rounds(balls=3, rounds=1, strength=0.8, steps=6, final=False), PAPER_EVS, "a first look"),
+    "balanced": Preset(Rounds(balls=5, rounds=1, strength=0.8, steps=20), PAPER_EVS, "a usable estimate"),
+    "paper": Preset(Rounds(balls=30, rounds=2, strength=0.8, steps=30), PAPER_EVS, "the paper's schedule, 4,932 steps"),
+}
+
+
+def preset(name: str) -> Preset:
+    """The preset of a name.
+
+    Raises:
+        OptionError: no such preset.
+    """
+    if name not in PRESETS:
+        raise OptionError("preset", name, ", ".join(PRESETS))
+    return PRESETS[name]
