@@ -5,7 +5,7 @@ Source: DiffusionLight, Fig. 2 (overview) and Sec. 4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -37,7 +37,7 @@ class Settings:
         height: rows of the latlong map.
     """
 
-    rounds: Rounds = Rounds()
+    rounds: Rounds = field(default_factory=Rounds)
     evs: tuple[float, ...] = PAPER_EVS
     seed: int = 0
     merge: str = "channel"

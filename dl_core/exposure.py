@@ -97,7 +97,7 @@ def check_evs(evs: Sequence[float]) -> tuple[float, ...]:
     accepted = "strictly descending EVs that start at 0, such as 0, -2.5, -5"
     if not values or values[0] != 0 or not all(a > b for a, b in pairwise(values)):
         raise OptionError("evs", tuple(evs), accepted)
-    if not all(-40 <= ev for ev in values):
+    if not all(ev >= -40 for ev in values):
         raise OptionError("evs", tuple(evs), accepted + ", none below -40")
     return values
 
@@ -181,8 +181,6 @@ MERGES: Final[dict[str, Callable[..., Tensor]]] = {"channel": merge_channel, "pa
 
 
 def merge_bracket(
-    balls: Sequence[Tensor], evs: Sequence[float], method: str = "channel", gamma: float = GAMMA
-) -> Tensor:
     balls: Sequence[Tensor], evs: Sequence[float], method: str = "channel", gamma: float = GAMMA
 ) -> Tensor:
     """Merge a bracket by the method of a given name (see `MERGES`).

@@ -5,7 +5,6 @@ Source: DiffusionLight, Sec. 4.1 and Algorithm 1, line 11.
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
