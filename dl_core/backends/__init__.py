@@ -1,0 +1,1 @@
+"""Painters on real diffusion models, and the models the package brings along."""
