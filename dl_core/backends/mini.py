@@ -164,6 +164,14 @@ def read_weights(path: Path) -> dict[str, torch.Tensor]:
         raise ModelError(path, f"is not a readable safetensors file ({error})") from error
 
 
+def _rename_text_keys(weights: dict[str, torch.Tensor], network: nn.Module) -> dict[str, torch.Tensor]:
+    """The files name text layers `text_model.…`, as the hub does; some transformers releases drop that prefix."""
+    prefix = "text_model."
+    if any(name.startswith(prefix) for name in network.state_dict()):
+        return weights
+    return {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
+
+
 def load_mini(folder: Path = MINI_FOLDER) -> MiniModel:
     """Load the mini model.
 
@@ -177,7 +185,7 @@ def load_mini(folder: Path = MINI_FOLDER) -> MiniModel:
     for name, network in model.networks().items():
         path = folder / NETWORK_FILES[name]
         try:
-            network.load_state_dict(read_weights(path))
+            network.load_state_dict(_rename_text_keys(read_weights(path), network))
         except RuntimeError as error:
             raise ModelError(path, f"holds another architecture than the mini model's {name} ({error})") from error
     lora = read_weights(folder / LORA_FILE) if (folder / LORA_FILE).exists() else None
