@@ -28,6 +28,7 @@ __all__ = [
     "CONTROLNET_CONFIG",
     "MINI_FOLDER",
     "NETWORK_FILES",
+    "SCHEDULER_CONFIG",
     "TEXT_CONFIG",
     "UNET_CONFIG",
     "MiniDefaults",
@@ -68,6 +69,15 @@ TEXT_CONFIG: Final[dict[str, Any]] = {
     "projection_dim": 32,
     "eos_token_id": 49407,
 }
+
+SCHEDULER_CONFIG: Final[dict[str, Any]] = {
+    "num_train_timesteps": 1000,
+    "beta_schedule": "scaled_linear",
+    "beta_start": 0.00085,
+    "beta_end": 0.012,
+    "prediction_type": "v_prediction",
+}
+"""SDXL's noise schedule; SDXL itself predicts epsilon."""
 
 NETWORK_FILES: Final = {
     "unet": "unet.safetensors",

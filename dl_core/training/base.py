@@ -1,0 +1,61 @@
+"""Train the mini model's base: UNet and text encoders on pictures of scenes with a chrome ball."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..backends.mini import MiniModel
+from .denoiser import TextBank, draw_batch, time_ids, velocity_loss
+from .loop import Budget, train
+from .scenes import SceneSampler
+
+__all__ = ["train_base"]
+
+
+def train_base(
+    model: MiniModel, sampler: SceneSampler, budget: Budget, folder: Path, *, batch: int, report: Callable[[str], None]
+) -> dict[str, dict[str, Tensor]]:
+    """Train UNet and text encoders together.
+
+    Args:
+        model: its networks are trained in place.
+        sampler: draws the pictures.
+        budget: steps and learning rate.
+        folder: for checkpoints and the log.
+        batch: pictures a step.
+        report: told of progress.
+
+    Returns:
+        Averaged weights by network name.
+    """
+    bank = TextBank(model)
+    side = model.defaults.canvas
+
+    def loss_of_step(step: int) -> Tensor:
+        drawn = draw_batch(sampler, step, batch, full_canvas=side)
+        tokens, pooled = bank.embed()
+        predicted = model.unet(
+            drawn.noisy,
+            drawn.timesteps,
+            tokens[drawn.captions],
+            added_cond_kwargs={"text_embeds": pooled[drawn.captions], "time_ids": time_ids(batch, side)},
+        ).sample
+        return velocity_loss(predicted, drawn)
+
+    networks = {name: getattr(model, name).train() for name in ("unet", "text_encoder", "text_encoder_2")}
+    if not (folder / "checkpoint.pt").is_file():
+        _wake_text_encoders(model)
+    return train(networks, loss_of_step, budget, folder, report=report)
+
+
+@torch.no_grad()
+def _wake_text_encoders(model: MiniModel) -> None:
+    """CLIP starts its embeddings at a deviation of 0.02, too faint for a UNet to hear within a short training."""
+    generator = torch.Generator().manual_seed(49408)
+    for encoder in (model.text_encoder, model.text_encoder_2):
+        embeddings = encoder.get_input_embeddings().weight
+        embeddings.copy_(0.5 * torch.randn(embeddings.shape, generator=generator))

@@ -1,0 +1,112 @@
+"""What base, ControlNet and LoRA training share: batches of noisy latents, text conditioning, the loss.
+
+The mini model predicts v = sqrt(ᾱ) ε - sqrt(1 - ᾱ) z (Salimans and Ho, Progressive Distillation, ICLR 2022). Its noise
+schedule is SDXL's. Predicting ε as SDXL does leaves a small network to state overall brightness and colour as a small
+difference between its input and its output at the noisiest steps, which is where lighting is settled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from diffusers import DDPMScheduler
+from jaxtyping import Float
+from torch import Tensor
+
+from ..backends.mini import SCHEDULER_CONFIG, MiniModel
+from ..ball import Ball, disc_mask
+from .autoencoder import block_latents
+from .scenes import BASE_CAPTIONS, SceneSampler
+
+__all__ = ["Batch", "TextBank", "draw_batch", "time_ids", "velocity_loss"]
+
+OFF_BALL_WEIGHT = 0.3
+"""Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Latents of training pictures at random noise levels.
+
+    Attributes:
+        noisy: (B, 4, m, m) latents with noise.
+        timesteps: (B,) in [0, 1000).
+        target: (B, 4, m, m) the velocity to predict.
+        weights: (B, 1, m, m) of the loss, about 1 on the ball.
+        captions: (B,) indices into `BASE_CAPTIONS`.
+        evs: (B,) exposure of each ball.
+        balls: where each ball is, in pixels of the full-size canvas.
+    """
+
+    noisy: Float[Tensor, "b 4 m m"]
+    timesteps: Tensor
+    target: Float[Tensor, "b 4 m m"]
+    weights: Float[Tensor, "b 1 m m"]
+    captions: Tensor
+    evs: Float[Tensor, "b"]
+    balls: tuple[Ball, ...]
+
+
+class TextBank:
+    """Embeddings of the few captions training uses, in the form SDXL's UNet takes them."""
+
+    def __init__(self, model: MiniModel) -> None:
+        self.model = model
+        self.tokens = [
+            tokenizer(list(BASE_CAPTIONS), padding="max_length", max_length=77, truncation=True, return_tensors="pt")
+            for tokenizer in (model.tokenizer, model.tokenizer_2)
+        ]
+
+    def embed(self) -> tuple[Float[Tensor, "k 77 c"], Float[Tensor, "k p"]]:
+        """Token embeddings (penultimate layers of both encoders) and pooled embeddings of all captions."""
+        first = self.model.text_encoder(self.tokens[0].input_ids, output_hidden_states=True)
+        second = self.model.text_encoder_2(self.tokens[1].input_ids, output_hidden_states=True)
+        return torch.cat((first.hidden_states[-2], second.hidden_states[-2]), dim=-1), second.text_embeds
+
+
+def time_ids(count: int, side: int) -> Float[Tensor, "b 6"]:
+    """SDXL's size conditioning for an uncropped square picture."""
+    return torch.tensor([[side, side, 0, 0, side, side]], dtype=torch.float32).expand(count, -1)
+
+
+def draw_batch(
+    sampler: SceneSampler, step: int, size: int, *, full_canvas: int, timesteps: tuple[int, int] = (0, 1000)
+) -> Batch:
+    """The batch of a step; it follows from the sampler's seed and the step alone.
+
+    A third of the noise levels fall in the noisiest 30%, where the layout of light is settled.
+    """
+    scale = full_canvas // sampler.canvas
+    pictures = [sampler.draw(step * size + i) for i in range(size)]
+    clean = block_latents(torch.cat([picture.canvas_ldr for picture in pictures]), 8 // scale)
+    generator = torch.Generator().manual_seed(sampler.seed * 7_919 + step)
+    low, high = timesteps
+    levels = torch.randint(low, high, (size,), generator=generator)
+    noisiest = torch.randint(low + (high - low) * 7 // 10, high, (size,), generator=generator)
+    levels = torch.where(torch.rand(size, generator=generator) < 0.33, noisiest, levels)
+    noise = torch.randn(clean.shape, generator=generator)
+    scheduler = DDPMScheduler(**SCHEDULER_CONFIG)
+    return Batch(
+        noisy=scheduler.add_noise(clean, noise, levels),
+        timesteps=levels,
+        target=scheduler.get_velocity(clean, noise, levels),
+        weights=torch.cat([_weights(picture.ball, clean.shape[-1]) for picture in pictures]),
+        captions=torch.tensor([picture.caption for picture in pictures]),
+        evs=torch.tensor([picture.ev for picture in pictures]),
+        balls=tuple(_enlarge(picture.ball, scale) for picture in pictures),
+    )
+
+
+def _weights(ball: Ball, side: int) -> Float[Tensor, "1 1 m m"]:
+    disc = torch.nn.functional.interpolate(disc_mask(ball, grow=ball.dilation)[None], size=(side, side), mode="area")
+    return OFF_BALL_WEIGHT + (1 - OFF_BALL_WEIGHT) * disc
+
+
+def _enlarge(ball: Ball, scale: int) -> Ball:
+    return Ball(ball.left * scale, ball.top * scale, ball.diameter * scale, ball.canvas * scale, ball.dilation * scale)
+
+
+def velocity_loss(predicted: Tensor, batch: Batch) -> Float[Tensor, ""]:
+    """Weighted mean squared error of the predicted velocity."""
+    return (batch.weights * (predicted - batch.target).square()).sum() / (batch.weights.sum() * predicted.shape[1])

@@ -1,0 +1,163 @@
+"""A training loop that can be killed at any moment: seeded, checkpointed, resumed where it stood."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..errors import Interrupted, OptionError
+
+__all__ = ["Budget", "average_weights", "train"]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long to train and how fast.
+
+    Attributes:
+        steps: optimizer steps in all.
+        learning_rate: at the end of the warm-up; it falls to zero along a cosine.
+        warmup: steps of linear warm-up.
+        checkpoint_seconds: time between checkpoints.
+    """
+
+    steps: int
+    learning_rate: float
+    warmup: int = 50
+    checkpoint_seconds: float = 120.0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise OptionError("steps", self.steps, "1 or more")
+        if not self.learning_rate > 0:
+            raise OptionError("learning rate", self.learning_rate, "above 0")
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step."""
+        if step < self.warmup:
+            return self.learning_rate * (step + 1) / self.warmup
+        progress = (step - self.warmup) / max(1, self.steps - self.warmup)
+        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+
+
+def average_weights(average: Tensor, current: Tensor, step: int, horizon: float = 0.998) -> None:
+    """Move an exponential average of weights towards the current ones; early steps are forgotten faster."""
+    decay = min(horizon, (1 + step) / (10 + step))
+    average.lerp_(current, 1 - decay)
+
+
+def train(
+    networks: Mapping[str, nn.Module],
+    loss_of_step: Callable[[int], Tensor],
+    budget: Budget,
+    folder: Path,
+    *,
+    report: Callable[[str], None],
+) -> dict[str, dict[str, Tensor]]:
+    """Train networks until the budget is used, resuming from the folder's checkpoint if there is one.
+
+    Args:
+        networks: what is trained; parameters without `requires_grad` stay as they are.
+        loss_of_step: the loss of a step's batch; it must follow from the step number alone, so that a resumed run
+            sees what the killed one would have seen.
+        budget: steps and learning rate.
+        folder: for `checkpoint.pt` and `log.jsonl` (step, loss, seconds).
+        report: told of progress about every ten seconds.
+
+    Returns:
+        Averaged weights (exponential moving average) by network.
+
+    Raises:
+        Interrupted: on Ctrl-C, after a checkpoint.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    trained = {
+        f"{name}/{key}": parameter
+        for name, network in networks.items()
+        for key, parameter in network.named_parameters()
+        if parameter.requires_grad
+    }
+    optimizer = torch.optim.AdamW(trained.values(), lr=budget.learning_rate, betas=(0.9, 0.99), weight_decay=0.01)
+    averages = {name: parameter.detach().clone() for name, parameter in trained.items()}
+    step = _resume(folder, networks, optimizer, averages)
+    losses: list[float] = []
+    spoken = saved = started = time.monotonic()
+    try:
+        while step < budget.steps:
+            for group in optimizer.param_groups:
+                group["lr"] = budget.rate(step)
+            loss = loss_of_step(step)
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(trained.values(), 1.0)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            step += 1
+            with torch.no_grad():
+                for name, parameter in trained.items():
+                    average_weights(averages[name], parameter, step)
+            losses.append(float(loss.detach()))
+            now = time.monotonic()
+            if now - spoken > 10 or step == budget.steps:
+                _log(folder, step, losses, now - started)
+                report(f"step {step}/{budget.steps}  loss {sum(losses) / len(losses):.4f}")
+                losses, spoken = [], now
+            if now - saved > budget.checkpoint_seconds:
+                _save(folder, step, networks, optimizer, averages)
+                saved = now
+    except KeyboardInterrupt as error:
+        _save(folder, step, networks, optimizer, averages)
+        raise Interrupted(f"training stopped at step {step}; run the same command again to go on") from error
+    _save(folder, step, networks, optimizer, averages)
+    return _averaged(networks, averages)
+
+
+def _averaged(networks: Mapping[str, nn.Module], averages: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    return {
+        name: {key: averages.get(f"{name}/{key}", value).detach() for key, value in network.state_dict().items()}
+        for name, network in networks.items()
+    }
+
+
+def _log(folder: Path, step: int, losses: list[float], seconds: float) -> None:
+    with (folder / "log.jsonl").open("a") as log:
+        log.write(json.dumps({"step": step, "loss": sum(losses) / len(losses), "seconds": round(seconds, 1)}) + "\n")
+
+
+def _save(
+    folder: Path,
+    step: int,
+    networks: Mapping[str, nn.Module],
+    optimizer: torch.optim.Optimizer,
+    averages: Mapping[str, Tensor],
+) -> None:
+    state = {
+        "step": step,
+        "networks": {name: network.state_dict() for name, network in networks.items()},
+        "optimizer": optimizer.state_dict(),
+        "averages": dict(averages),
+    }
+    partial = folder / "checkpoint.partial"
+    torch.save(state, partial)
+    partial.replace(folder / "checkpoint.pt")
+
+
+def _resume(
+    folder: Path, networks: Mapping[str, nn.Module], optimizer: torch.optim.Optimizer, averages: dict[str, Tensor]
+) -> int:
+    path = folder / "checkpoint.pt"
+    if not path.is_file():
+        return 0
+    state: dict[str, Any] = torch.load(path, weights_only=True)
+    for name, network in networks.items():
+        network.load_state_dict(state["networks"][name])
+    optimizer.load_state_dict(state["optimizer"])
+    averages.update(state["averages"])
+    return int(state["step"])
