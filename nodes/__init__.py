@@ -1,0 +1,34 @@
+"""The nodes, one file per stage of the method. ComfyUI is imported here and below, nowhere else in the pack."""
+
+from __future__ import annotations
+
+from comfy_api.latest import ComfyExtension, io
+
+from .depth_ball import DepthBallMask
+from .envmap_files import LoadEnvMap, SaveEnvMap
+from .equirect import BallToEquirect
+from .exposure import EVPromptInterp, HDRMerge
+from .inpaint import ChromeBallInpaint, IterativeMedian
+from .loaders import MiniProbeLoader
+
+__all__ = ["NODES", "LightProbeExtension"]
+
+NODES: tuple[type[io.ComfyNode], ...] = (
+    MiniProbeLoader,
+    DepthBallMask,
+    EVPromptInterp,
+    ChromeBallInpaint,
+    IterativeMedian,
+    HDRMerge,
+    BallToEquirect,
+    SaveEnvMap,
+    LoadEnvMap,
+)
+
+
+class LightProbeExtension(ComfyExtension):  # type: ignore[misc]
+    """What ComfyUI asks for the pack's nodes."""
+
+    async def get_node_list(self) -> list[type[io.ComfyNode]]:
+        """All nodes, in the order of the method."""
+        return list(NODES)

@@ -1,0 +1,201 @@
+"""EVPromptInterp and HDRMerge: one prompt per exposure, and the exposures back into radiance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import comfy.sd
+import comfy.utils
+import folder_paths
+import torch
+from comfy_api.latest import io
+
+from ..dl_core.errors import ModelError, OptionError
+from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
+from .sockets import CATEGORY, as_rgb, parse_evs
+
+__all__ = ["EVPromptInterp", "HDRMerge", "interpolate_conditioning"]
+
+NO_LORA: Final = "none"
+PROMPT: Final = "a perfect mirrored reflective chrome ball sphere"
+DARK_PROMPT: Final = "a perfect black dark mirrored reflective chrome ball sphere"
+
+
+def interpolate_conditioning(original: Any, dark: Any, weight: float) -> Any:
+    """Conditioning between two: original + weight x (dark - original), for token and pooled embeddings alike.
+
+    Args:
+        original: CONDITIONING of the prompt at EV 0, a list of [(1, n, width) embedding, options].
+        dark: CONDITIONING of the dark prompt, as many items. Prompts over 77 tokens come in chunks of 77; of a pair of
+            different lengths both are repeated to a common one, which changes nothing for cross attention.
+        weight: 0 is the original, 1 the dark one.
+
+    Raises:
+        OptionError: conditionings of different numbers of items.
+
+    Source: DiffusionLight, Sec. 4.2 (exposure LoRA: interpolated text embeddings).
+    """
+    if len(original) != len(dark):
+        raise OptionError("dark_prompt", f"{len(dark)} conditionings", f"as many as prompt has, {len(original)}")
+    return [_between(a, b, weight) for a, b in zip(original, dark, strict=True)]
+
+
+def _between(original: Any, dark: Any, weight: float) -> Any:
+    (tokens, options), (dark_tokens, dark_options) = original, dark
+    length = math.lcm(tokens.shape[1], dark_tokens.shape[1])
+    tokens, dark_tokens = (item.repeat(1, length // item.shape[1], 1) for item in (tokens, dark_tokens))
+    pooled = torch.lerp(options["pooled_output"], dark_options["pooled_output"], weight)
+    return [torch.lerp(tokens, dark_tokens, weight), {**options, "pooled_output": pooled}]
+
+
+class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
+    """Conditionings that steer the exposure of a ball."""
+
+    @classmethod
+    def define_schema(cls) -> io.Schema:
+        """Sockets of the node."""
+        return io.Schema(
+            node_id="EVPromptInterp",
+            display_name="EV Prompt Interpolation",
+            category=CATEGORY,
+            description="Makes one conditioning per exposure value, on the line from the prompt (EV 0) to the dark "
+            "prompt (EV min). Nodes that follow run once per EV; HDR Merge gathers them again.",
+            inputs=[
+                io.Clip.Input("clip", tooltip="Text encoders of the model."),
+                io.Model.Input(
+                    "model", optional=True, tooltip="The denoiser, if this node is to load the LoRA into it."
+                ),
+                io.String.Input("prompt", default=PROMPT, multiline=True, tooltip="A mirror ball at EV 0."),
+                io.String.Input("dark_prompt", default=DARK_PROMPT, multiline=True, tooltip="A mirror ball at EV min."),
+                io.String.Input(
+                    "evs",
+                    default="0, -2.5, -5",
+                    tooltip="Exposure values between commas: they start at 0 and descend. The paper's are 0, -2.5, -5.",
+                ),
+                io.Float.Input(
+                    "ev_min",
+                    default=-5.0,
+                    min=-20.0,
+                    max=-0.1,
+                    step=0.1,
+                    tooltip="The exposure value of the dark prompt, as the exposure LoRA was trained: -5.",
+                ),
+                io.Combo.Input(
+                    "lora",
+                    options=[NO_LORA, *folder_paths.get_filename_list("loras")],
+                    default=NO_LORA,
+                    tooltip="Exposure LoRA to load into the model. Choose none where a loader has done so already.",
+                ),
+                io.Float.Input(
+                    "lora_scale",
+                    default=0.75,
+                    min=0.0,
+                    max=2.0,
+                    step=0.05,
+                    tooltip="How strongly the LoRA acts. The paper uses 0.75.",
+                ),
+            ],
+            outputs=[
+                io.Model.Output(
+                    "model_out", display_name="model", tooltip="The model, with the LoRA if one was chosen."
+                ),
+                io.Conditioning.Output("positive", is_output_list=True, tooltip="One conditioning per EV."),
+                io.Float.Output("ev", is_output_list=True, tooltip="The EVs, in the same order."),
+            ],
+        )
+
+    @classmethod
+    def execute(
+        cls,
+        clip: Any,
+        prompt: str,
+        dark_prompt: str,
+        evs: str,
+        ev_min: float,
+        lora: str,
+        lora_scale: float,
+        model: Any = None,
+    ) -> io.NodeOutput:
+        """Encode both prompts once and interpolate between these originals for every EV."""
+        values = check_evs(parse_evs(evs))
+        if values[-1] < ev_min:
+            raise OptionError("evs", evs, f"EVs down to ev_min, {ev_min:g}, where the dark prompt stands alone")
+        original, dark = (clip.encode_from_tokens_scheduled(clip.tokenize(text)) for text in (prompt, dark_prompt))
+        positive = [interpolate_conditioning(original, dark, ev / ev_min) for ev in values]
+        return io.NodeOutput(_with_lora(model, lora, lora_scale), positive, list(values))
+
+
+def _with_lora(model: Any, lora: str, scale: float) -> Any:
+    """The model with a LoRA file of ComfyUI's folder, or as it is.
+
+    Raises:
+        ModelError: a LoRA without a model, or a file that changes nothing in it.
+    """
+    if lora == NO_LORA:
+        return model
+    if model is None:
+        raise ModelError("socket model", "is not connected; it has to be for a LoRA to be loaded")
+    weights = comfy.utils.load_torch_file(folder_paths.get_full_path_or_raise("loras", lora), safe_load=True)
+    patched = comfy.sd.load_lora_for_models(model, None, weights, scale, 0)[0]
+    if len(patched.patches) == len(model.patches):
+        raise ModelError(lora, "has no weights for the model in socket model; a LoRA for SDXL's UNet is accepted")
+    return patched
+
+
+class HDRMerge(io.ComfyNode):  # type: ignore[misc]
+    """Merges the balls of a bracket."""
+
+    @classmethod
+    def define_schema(cls) -> io.Schema:
+        """Sockets of the node."""
+        return io.Schema(
+            node_id="HDRMerge",
+            display_name="HDR Merge",
+            category=CATEGORY,
+            description="Gathers one ball per exposure value and merges them into linear radiance; white at EV 0 is 1.",
+            is_input_list=True,
+            inputs=[
+                io.Image.Input("balls", tooltip="One display-encoded ball per EV, as a list."),
+                io.Float.Input("ev", force_input=True, tooltip="The EVs of the balls, as a list: 0 first, descending."),
+                io.Combo.Input(
+                    "method",
+                    options=list(MERGES),
+                    tooltip="channel: each colour by itself, so that coloured lights keep their colour. "
+                    "paper: luminance only, with the chroma of EV 0, which hides exposures that do not align.",
+                ),
+                io.Float.Input(
+                    "gamma",
+                    default=GAMMA,
+                    min=1.0,
+                    max=4.0,
+                    step=0.05,
+                    tooltip="Gamma of the display encoding that the balls were painted in: 2.4.",
+                ),
+                io.String.Input(
+                    "report",
+                    optional=True,
+                    force_input=True,
+                    tooltip="Reports of the nodes that painted the balls, to be passed on as one.",
+                ),
+            ],
+            outputs=[
+                io.Image.Output("hdr", tooltip="The ball in linear radiance, unbounded."),
+                io.String.Output("report_out", display_name="report", tooltip="The reports, and how they were merged."),
+            ],
+        )
+
+    @classmethod
+    def execute(
+        cls,
+        balls: Sequence[torch.Tensor],
+        ev: Sequence[float],
+        method: Sequence[str],
+        gamma: Sequence[float],
+        report: Sequence[str] = (),
+    ) -> io.NodeOutput:
+        """Merge; every input is a list, options have one item."""
+        merged = merge_bracket([as_rgb(ball, "balls") for ball in balls], ev, method[0], gamma[0])
+        summary = f"Merged EV {', '.join(f'{value:g}' for value in ev)} by the method {method[0]}, gamma {gamma[0]:g}."
+        return io.NodeOutput(merged, "\n".join([*report, summary]))

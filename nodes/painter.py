@@ -1,0 +1,320 @@
+"""ComfyPainter: the Painter port on ComfyUI's own sampling.
+
+With nodes/mini.py this is the only file that touches ComfyUI's internals: `comfy.sample.sample_custom`,
+`comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules), a model's `model_function_wrapper`, `model_sampling`
+and `model_config`, a ControlNet's `copy` and `set_cond_hint`, and a VAE's `encode` and `decode`.
+
+How it differs from the paper's Algorithm 0 in its authors' code. Outside the mask both hold the photograph's latent
+with the same initial noise at the level of every evaluation (there: put in after a step; here: before an evaluation,
+which is the same moment). At strength 1 the first evaluation there sees pure noise everywhere; here the photograph is
+already around the disc. On cells the mask covers partly, here the estimate is blended with the clean latent too. The
+autoencoder's mode is encoded, not a sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import comfy.controlnet
+import comfy.model_base
+import comfy.model_management
+import comfy.sample
+import comfy.samplers
+import torch
+
+from ..dl_core.ball import Ball, crop_ball, disc_mask
+from ..dl_core.errors import ModelError, OptionError
+from ..dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+from ..dl_core.shapes import BallImage, Image, Mask
+
+__all__ = ["LEADING", "SAMPLERS", "SCHEDULERS", "ComfyPainter", "Guidance", "Networks", "leading_timesteps"]
+
+SAMPLERS: Final = tuple(
+    name
+    for name in ("uni_pc", "uni_pc_bh2", "euler", "dpmpp_2m", "deis", "ipndm", "ipndm_v", "lms", "res_multistep")
+    if name in comfy.samplers.KSampler.SAMPLERS
+)
+"""ComfyUI's samplers that evaluate the model once a step and draw no noise of their own.
+
+The others would break one of the method's rules: that a ball depends on its seed alone and not on who shares its
+batch, that exposures share their noise, and that the cost of a run is known before it starts. ComfyUI's `ddim` is
+`euler` with another noise around the mask.
+"""
+
+LEADING: Final = "leading (paper)"
+SCHEDULERS: Final = (LEADING, *(name for name in comfy.samplers.KSampler.SCHEDULERS if name != "ddim_uniform"))
+"""The paper's schedule, then ComfyUI's, except one that does not keep to the number of steps asked for."""
+
+DECODE_MARGIN: Final = 8
+"""Latent cells decoded around the ball, so that the decoder sees the ball's surroundings."""
+
+
+@dataclass(frozen=True)
+class Networks:
+    """What a graph connects to a node that paints, by socket.
+
+    Attributes:
+        model: MODEL of SDXL's architecture.
+        positive: CONDITIONING of the ball at the exposure to paint.
+        negative: CONDITIONING to move away from.
+        vae: VAE of the model.
+        control_net: CONTROL_NET for depth, of SDXL's architecture.
+    """
+
+    model: Any
+    positive: Any
+    negative: Any
+    vae: Any
+    control_net: Any
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """How the model is steered and sampled.
+
+    Attributes:
+        cfg: scale of classifier-free guidance; at 1 the negative prompt is not evaluated.
+        sampler: of `SAMPLERS`.
+        scheduler: of `SCHEDULERS`.
+        control_strength: of the depth ControlNet; at 0 it is not evaluated.
+        batch_size: balls painted at once.
+    """
+
+    cfg: float = 5.0
+    sampler: str = "uni_pc"
+    scheduler: str = LEADING
+    control_strength: float = 0.5
+    batch_size: int = 4
+
+    def __post_init__(self) -> None:
+        for name, value, accepted in (("sampler", self.sampler, SAMPLERS), ("scheduler", self.scheduler, SCHEDULERS)):
+            if value not in accepted:
+                raise OptionError(name, value, ", ".join(accepted))
+        if self.batch_size < 1:
+            raise OptionError("batch_size", self.batch_size, "1 or more")
+
+
+def leading_timesteps(steps: int, trained: int = 1000) -> list[int]:
+    """Timesteps that UniPC visits with SDXL's scheduler settings (leading spacing, offset 1), first to last.
+
+    30 steps visit 961, 929 … 33.
+
+    Raises:
+        OptionError: fewer timesteps than steps.
+    """
+    stride = trained // (steps + 1)
+    if stride < 1:
+        raise OptionError("steps", steps, f"1 to {trained - 1}")
+    return [stride * (steps - i) + 1 for i in range(steps)]
+
+
+class ComfyPainter:
+    """Paints chrome balls with a graph's MODEL, CONDITIONING, VAE and CONTROL_NET."""
+
+    def __init__(
+        self,
+        networks: Networks,
+        guidance: Guidance,
+        *,
+        mask: Mask | None = None,
+        on_balls: Callable[[BallImage], None] | None = None,
+    ) -> None:
+        """Take the graph's models.
+
+        Args:
+            networks: what the graph connects.
+            guidance: how to sample.
+            mask: (1, S, S) where to paint; the ball's disc grown by its dilation when not given.
+            on_balls: hears of the balls of a request painted so far, (n, D, D, 3), after every batch.
+
+        Raises:
+            ModelError: a model or conditioning of another architecture; the socket is named.
+        """
+        _require_sdxl(networks)
+        for socket in ("positive", "negative"):
+            _require_conditioning(socket, getattr(networks, socket), networks.model)
+        self._networks, self._guidance = networks, guidance
+        self._mask, self._on_balls = mask, on_balls
+
+    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+        """Denoiser evaluations that painting so many balls takes, exactly."""
+        return balls * (steps - first_step(steps, strength)) * (1 if self._guidance.cfg == 1 else 2)
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        """Paint the balls of a request.
+
+        ComfyUI's interruption is honoured before every evaluation of the model, and passes through as ComfyUI's own
+        exception.
+
+        Raises:
+            OptionError: a schedule the sampler cannot run.
+        """
+        counter = _Counter(observer)
+        model = _watched(self._networks.model, counter)
+        latent = self._networks.vae.encode(request.canvas)
+        positive, negative = self._controlled(request)
+        mask = self._mask if self._mask is not None else disc_mask(request.ball, grow=request.ball.dilation)
+        sigmas = self._sigmas(request.steps)[first_step(request.steps, request.strength) :]
+        if len(sigmas) < 3 and self._guidance.sampler.startswith("uni_pc"):
+            raise OptionError(
+                "steps", request.steps, f"at least 2 steps to run with the sampler {self._guidance.sampler}"
+            )
+        painted: list[BallImage] = []
+        for start in range(0, len(request.seeds), self._guidance.batch_size):
+            seeds = request.seeds[start : start + self._guidance.batch_size]
+            samples = comfy.sample.sample_custom(
+                model,
+                _noise(seeds, latent),
+                self._guidance.cfg,
+                _sampler(self._guidance.sampler, model, from_noise=request.strength == 1),
+                sigmas.clone(),  # uni_pc writes into it
+                positive,
+                negative,
+                latent.expand(len(seeds), -1, -1, -1),
+                noise_mask=mask,
+                disable_pbar=True,
+                seed=seeds[0],
+            )
+            painted.append(_decode_ball(self._networks.vae, samples, request.ball))
+            if self._on_balls:
+                self._on_balls(torch.cat(painted))
+        return PaintResult(torch.cat(painted), counter.count)
+
+    def _sigmas(self, steps: int) -> torch.Tensor:
+        """Noise levels of a full schedule, (steps + 1,), the last one 0."""
+        guidance, sampling = self._guidance, self._networks.model.get_model_object("model_sampling")
+        if guidance.scheduler == LEADING:
+            levels = sampling.sigma(torch.tensor(leading_timesteps(steps), dtype=torch.float32))
+            return torch.cat((levels.float().cpu(), torch.zeros(1)))
+        schedule = comfy.samplers.KSampler(
+            self._networks.model, steps, "cpu", guidance.sampler, guidance.scheduler, denoise=1.0
+        )
+        if len(schedule.sigmas) != steps + 1:
+            raise OptionError("scheduler", guidance.scheduler, f"a schedule that can be cut into {steps} steps")
+        return schedule.sigmas.float()
+
+    def _controlled(self, request: PaintRequest) -> tuple[Any, Any]:
+        """Both conditionings with SDXL's picture sizes (their own win) and the depth control (after any they have)."""
+        side = request.ball.canvas
+        sizes = {"width": side, "height": side, "target_width": side, "target_height": side}
+        hint = request.depth.movedim(-1, 1)
+        controls: dict[int, Any] = {}
+
+        def with_control(options: dict[str, Any]) -> dict[str, Any]:
+            strength = self._guidance.control_strength
+            if strength == 0:
+                return {}
+            # Prompts share one control object: ComfyUI evaluates only such conditionings together.
+            previous = options.get("control")
+            if id(previous) not in controls:
+                control = self._networks.control_net.copy().set_cond_hint(
+                    hint, strength, (0.0, 1.0), vae=self._networks.vae
+                )
+                control.set_previous_controlnet(previous)
+                controls[id(previous)] = control
+            return {"control": controls[id(previous)], "control_apply_to_uncond": False}
+
+        def dress(conditioning: Any) -> Any:
+            return [[embedding, {**sizes, **options, **with_control(options)}] for embedding, options in conditioning]
+
+        return dress(self._networks.positive), dress(self._networks.negative)
+
+
+class _Counter:
+    """Counts evaluations of the model, and tells an observer."""
+
+    def __init__(self, observer: Observer) -> None:
+        self.count = 0
+        self._observer = observer
+
+    def add(self, evaluations: int) -> None:
+        self.count += evaluations
+        self._observer.evaluated(evaluations)
+
+
+def _watched(model: Any, counter: _Counter) -> Any:
+    """A clone of a MODEL that counts its evaluations and gives way to interruption before each."""
+    watched = model.clone()
+    wrapped = watched.model_options.get("model_function_wrapper")
+
+    def evaluate(apply_model: Callable[..., torch.Tensor], arguments: dict[str, Any]) -> torch.Tensor:
+        comfy.model_management.throw_exception_if_processing_interrupted()
+        if wrapped is None:
+            output = apply_model(arguments["input"], arguments["timestep"], **arguments["c"])
+        else:
+            output = wrapped(apply_model, arguments)
+        counter.add(len(arguments["input"]))
+        return output
+
+    watched.set_model_unet_function_wrapper(evaluate)
+    return watched
+
+
+def _noise(seeds: tuple[int, ...], latent: torch.Tensor) -> torch.Tensor:
+    """Noise of each ball from its own seed, drawn on the CPU: a ball does not depend on its batch or device."""
+    shape = (1, *latent.shape[1:])
+    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+
+
+def _sampler(name: str, model: Any, *, from_noise: bool) -> Any:
+    """ComfyUI's sampler of a name; with `from_noise` it starts from noise alone.
+
+    ComfyUI adds noise to the latent it is given, which lets the photograph shine through the first level of noise
+    where the method wants a ball from nothing.
+    """
+    sampler = comfy.samplers.sampler_object(name)
+    if not from_noise:
+        return sampler
+    sampling = model.get_model_object("model_sampling")
+
+    def start_from_noise(inpaint: Any, x: torch.Tensor, sigmas: torch.Tensor, **options: Any) -> torch.Tensor:
+        noise = sampling.noise_scaling(sigmas[0], inpaint.noise, torch.zeros_like(x), True)
+        return sampler.sampler_function(inpaint, noise, sigmas, **options)
+
+    return comfy.samplers.KSAMPLER(start_from_noise, sampler.extra_options, sampler.inpaint_options)
+
+
+def _decode_ball(vae: Any, samples: torch.Tensor, ball: Ball) -> BallImage:
+    """Decode the ball's neighbourhood and cut the ball out: (N, C, h, w) latents -> (N, D, D, 3) in [0, 1]."""
+    cell = ball.canvas // samples.shape[-1]
+    rows, columns = (_neighbourhood(start, ball.diameter, cell, samples.shape[-1]) for start in (ball.top, ball.left))
+    pixels: Image = vae.decode(samples[:, :, rows, columns])
+    window = Ball(ball.left - columns.start * cell, ball.top - rows.start * cell, ball.diameter, 0, 0)
+    return crop_ball(pixels, window).clamp(0, 1)
+
+
+def _neighbourhood(start: int, length: int, cell: int, cells: int) -> slice:
+    """Latent cells that cover `length` pixels from `start`, with a margin."""
+    first = max(0, start // cell - DECODE_MARGIN)
+    return slice(first, min(cells, -(-(start + length) // cell) + DECODE_MARGIN))
+
+
+def _require_sdxl(networks: Networks) -> None:
+    inner = getattr(networks.model, "model", None)
+    if not isinstance(inner, comfy.model_base.SDXL):
+        raise ModelError("socket model", f"holds {type(inner).__name__}; a model of SDXL's architecture is accepted")
+    channels = getattr(networks.vae, "latent_channels", None)
+    wanted = inner.latent_format.latent_channels
+    if channels != wanted:
+        raise ModelError("socket vae", f"holds a VAE of {channels} latent channels; the model's has {wanted}")
+    control_net = networks.control_net
+    if not isinstance(control_net, comfy.controlnet.ControlBase):
+        raise ModelError("socket control_net", f"holds {type(control_net).__name__}; a ControlNet is accepted")
+    network = getattr(control_net, "control_model", None)
+    if network is not None and getattr(network, "num_classes", "unknown") is None:
+        raise ModelError("socket control_net", "holds a ControlNet of another architecture; one for SDXL is accepted")
+
+
+def _require_conditioning(socket: str, conditioning: Any, model: Any) -> None:
+    wanted = model.model.model_config.unet_config["context_dim"]
+    if not conditioning:
+        raise ModelError(f"socket {socket}", "holds no conditioning")
+    for embedding, options in conditioning:
+        if embedding.shape[-1] != wanted or options.get("pooled_output") is None:
+            raise ModelError(
+                f"socket {socket}",
+                f"holds embeddings {embedding.shape[-1]} wide; the model takes {wanted} with a pooled output: "
+                "encode the prompt with the CLIP that belongs to the model",
+            )

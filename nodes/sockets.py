@@ -1,0 +1,44 @@
+"""What the nodes share: the category, the BALL socket, and the conversions between ComfyUI's layouts and ours.
+
+ComfyUI's IMAGE is (B, H, W, C) floats, display-encoded by convention though never checked; its MASK is (B, H, W) or
+(H, W). Both are the library's `Image` and `Mask`, so that most values pass through unchanged.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from comfy_api.latest import io
+
+from ..dl_core.errors import ImageError, OptionError
+
+__all__ = ["CATEGORY", "BallSocket", "as_rgb", "parse_evs"]
+
+CATEGORY: Final = "LightProbe"
+
+BallSocket = io.Custom("BALL")
+"""A `dl_core.ball.Ball`: where the ball sits on the canvas."""
+
+
+def as_rgb(image: torch.Tensor, socket: str) -> torch.Tensor:
+    """An IMAGE of one, three or four channels as (B, H, W, 3): grey is repeated, alpha dropped.
+
+    Raises:
+        ImageError: another layout; `socket` is named.
+    """
+    if image.ndim != 4 or image.shape[-1] not in (1, 3, 4):
+        raise ImageError(socket, f"has shape {tuple(image.shape)}; (batch, height, width, 1, 3 or 4) is accepted")
+    return image.expand(-1, -1, -1, 3) if image.shape[-1] == 1 else image[..., :3]
+
+
+def parse_evs(text: str) -> tuple[float, ...]:
+    """EVs written as text, "0, -2.5, -5".
+
+    Raises:
+        OptionError: something that is not a number.
+    """
+    try:
+        return tuple(float(part) for part in text.replace(";", ",").split(",") if part.strip())
+    except ValueError as error:
+        raise OptionError("evs", text, "numbers between commas, such as 0, -2.5, -5") from error
