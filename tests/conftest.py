@@ -8,7 +8,7 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 # Before anything of the library is imported: its jaxtyping annotations are checked in tests, and only there.
-install_import_hook("dl_core", "beartype.beartype")
+install_import_hook("dl_core", "shape_checks.check")
 
 # Two busy cores make times meaningless; a failing example is printed and can be repeated.
 settings.register_profile("suite", deadline=None, max_examples=30, derandomize=True, print_blob=True)
