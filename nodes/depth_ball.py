@@ -7,7 +7,7 @@ from comfy_api.latest import io
 
 from ..dl_core.ball import disc_mask, fit_canvas, paint_depth, place_ball
 from ..dl_core.estimate import check_photograph
-from .sockets import CATEGORY, BallSocket, as_rgb
+from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 
 __all__ = ["DepthBallMask"]
 
@@ -74,12 +74,10 @@ class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
                 ),
             ],
             outputs=[
-                io.Image.Output("canvas_image", tooltip="The photograph on its canvas."),
-                io.Image.Output(
-                    "control_depth", tooltip="The depth map with the ball painted nearest, for ControlNet."
-                ),
-                io.Mask.Output("mask", tooltip="The disc to inpaint."),
-                BallSocket.Output("ball", tooltip="Where the ball sits."),
+                named_output(io.Image, "canvas_image", "The photograph on its canvas."),
+                named_output(io.Image, "control_depth", "The depth map with the ball painted nearest, for ControlNet."),
+                named_output(io.Mask, "mask", "The disc to inpaint."),
+                named_output(BallSocket, "ball", "Where the ball sits."),
             ],
         )
 

@@ -13,7 +13,7 @@ from comfy_api.latest import io, ui
 
 from ..dl_core.errors import OutputError
 from ..dl_core.imageio import read_envmap, tone_map_preview, write_exr, write_hdr, write_png
-from .sockets import CATEGORY, as_rgb
+from .sockets import CATEGORY, as_rgb, named_output
 
 __all__ = ["LoadEnvMap", "SaveEnvMap"]
 
@@ -49,7 +49,7 @@ class SaveEnvMap(io.ComfyNode):  # type: ignore[misc]
                     "report", optional=True, force_input=True, tooltip="What was run, to be kept in the file."
                 ),
             ],
-            outputs=[io.String.Output("path", tooltip="Where the EXR files are, one a line.")],
+            outputs=[named_output(io.String, "path", "Where the EXR files are, one a line.")],
         )
 
     @classmethod
@@ -127,7 +127,7 @@ class LoadEnvMap(io.ComfyNode):  # type: ignore[misc]
             category=CATEGORY,
             description="Reads an equirectangular map (EXR or Radiance .hdr) from ComfyUI's input folder.",
             inputs=[io.Combo.Input("file", options=names, tooltip="An .exr or .hdr file in ComfyUI's input folder.")],
-            outputs=[io.Image.Output("latlong", tooltip="The map in linear radiance.")],
+            outputs=[named_output(io.Image, "latlong", "The map in linear radiance.")],
         )
 
     @classmethod

@@ -8,7 +8,7 @@ from comfy_api.latest import io
 from ..dl_core.ball import Ball, crop_ball, require_canvas
 from ..dl_core.errors import ImageError
 from ..dl_core.geometry import ball_to_latlong, camera_rotation, disc_coordinates, latlong_directions, rotate_latlong
-from .sockets import CATEGORY, BallSocket, as_rgb
+from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 
 __all__ = ["BallToEquirect"]
 
@@ -46,10 +46,11 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                 ),
             ],
             outputs=[
-                io.Image.Output("latlong", tooltip="The map, in the encoding of the image."),
-                io.Mask.Output(
+                named_output(io.Image, "latlong", "The map, in the encoding of the image."),
+                named_output(
+                    io.Mask,
                     "coverage",
-                    tooltip="1 where the ball shows a direction; 0 straight ahead, within half a pixel of its rim.",
+                    "1 where the ball shows a direction; 0 straight ahead, within half a pixel of its rim.",
                 ),
             ],
         )

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-import comfy.sd
 import comfy.utils
 import folder_paths
 import torch
@@ -14,7 +13,8 @@ from comfy_api.latest import io
 
 from ..dl_core.errors import ModelError, OptionError
 from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
-from .sockets import CATEGORY, as_rgb, parse_evs
+from .lora import with_lora
+from .sockets import CATEGORY, as_rgb, named_output, parse_evs
 
 __all__ = ["EVPromptInterp", "HDRMerge", "interpolate_conditioning"]
 
@@ -98,11 +98,9 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
                 ),
             ],
             outputs=[
-                io.Model.Output(
-                    "model_out", display_name="model", tooltip="The model, with the LoRA if one was chosen."
-                ),
-                io.Conditioning.Output("positive", is_output_list=True, tooltip="One conditioning per EV."),
-                io.Float.Output("ev", is_output_list=True, tooltip="The EVs, in the same order."),
+                named_output(io.Model, "model", "The model, with the LoRA if one was chosen."),
+                named_output(io.Conditioning, "positive", "One conditioning per EV.", is_list=True),
+                named_output(io.Float, "ev", "The EVs, in the same order.", is_list=True),
             ],
         )
 
@@ -131,17 +129,14 @@ def _with_lora(model: Any, lora: str, scale: float) -> Any:
     """The model with a LoRA file of ComfyUI's folder, or as it is.
 
     Raises:
-        ModelError: a LoRA without a model, or a file that changes nothing in it.
+        ModelError: a LoRA without a model, or one that does not fit it.
     """
     if lora == NO_LORA:
         return model
     if model is None:
         raise ModelError("socket model", "is not connected; it has to be for a LoRA to be loaded")
     weights = comfy.utils.load_torch_file(folder_paths.get_full_path_or_raise("loras", lora), safe_load=True)
-    patched = comfy.sd.load_lora_for_models(model, None, weights, scale, 0)[0]
-    if len(patched.patches) == len(model.patches):
-        raise ModelError(lora, "has no weights for the model in socket model; a LoRA for SDXL's UNet is accepted")
-    return patched
+    return with_lora(model, weights, scale, f"lora {lora}")
 
 
 class HDRMerge(io.ComfyNode):  # type: ignore[misc]
@@ -181,8 +176,8 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
                 ),
             ],
             outputs=[
-                io.Image.Output("hdr", tooltip="The ball in linear radiance, unbounded."),
-                io.String.Output("report_out", display_name="report", tooltip="The reports, and how they were merged."),
+                named_output(io.Image, "hdr", "The ball in linear radiance, unbounded."),
+                named_output(io.String, "report", "The reports, and how they were merged."),
             ],
         )
 

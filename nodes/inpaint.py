@@ -19,7 +19,7 @@ from ..dl_core.painter import PaintRequest
 from ..dl_core.presets import PRESETS
 from .painter import SAMPLERS, SCHEDULERS, ComfyPainter, Guidance, Networks
 from .progress import BarObserver
-from .sockets import CATEGORY, BallSocket, as_rgb
+from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 
 __all__ = ["ChromeBallInpaint", "IterativeMedian"]
 
@@ -157,9 +157,9 @@ class ChromeBallInpaint(io.ComfyNode):  # type: ignore[misc]
                 *_sampling_inputs(),
             ],
             outputs=[
-                io.Image.Output("balls", tooltip="The balls, cut out, display-encoded, in the order of their seeds."),
-                io.Image.Output("composite", tooltip="The canvas image with each ball pasted in."),
-                io.Int.Output("evaluations", tooltip="Evaluations of the denoiser that this took."),
+                named_output(io.Image, "balls", "The balls, cut out, display-encoded, in the order of their seeds."),
+                named_output(io.Image, "composite", "The canvas image with each ball pasted in."),
+                named_output(io.Int, "evaluations", "Evaluations of the denoiser that this took."),
             ],
         )
 
@@ -232,13 +232,11 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 *_sampling_inputs(),
             ],
             outputs=[
-                io.Image.Output("result", display_name="ball", tooltip="The answer, display-encoded."),
-                io.Image.Output("median", tooltip="The last median."),
-                io.Image.Output(
-                    "spread", tooltip="How far the last round's balls lie from it: their median deviation."
-                ),
-                io.Image.Output("composite", tooltip="The canvas image with the answer pasted in."),
-                io.String.Output("report", tooltip="What was run and what it cost."),
+                named_output(io.Image, "ball", "The answer, cut out, display-encoded."),
+                named_output(io.Image, "median", "The last median."),
+                named_output(io.Image, "spread", "How far the last round's balls lie from it: their median deviation."),
+                named_output(io.Image, "composite", "The canvas image with the answer pasted in."),
+                named_output(io.String, "report", "What was run and what it cost."),
             ],
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from comfy_api.latest import io
 
-from .sockets import CATEGORY
+from .sockets import CATEGORY, named_output
 
 __all__ = ["MiniProbeLoader"]
 
@@ -32,10 +32,10 @@ class MiniProbeLoader(io.ComfyNode):  # type: ignore[misc]
                 ),
             ],
             outputs=[
-                io.Model.Output("model", tooltip="The denoiser, with its exposure LoRA."),
-                io.Clip.Output("clip", tooltip="Both text encoders."),
-                io.Vae.Output("vae", tooltip="The autoencoder."),
-                io.ControlNet.Output("control_net", tooltip="The depth ControlNet."),
+                named_output(io.Model, "model", "The denoiser, with its exposure LoRA."),
+                named_output(io.Clip, "clip", "Both text encoders."),
+                named_output(io.Vae, "vae", "The autoencoder."),
+                named_output(io.ControlNet, "control_net", "The depth ControlNet."),
             ],
         )
 

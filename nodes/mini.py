@@ -26,6 +26,7 @@ import torch
 
 from ..dl_core.backends.mini import CONTROLNET_CONFIG, TEXT_CONFIG, UNET_CONFIG, MiniModel
 from ..dl_core.errors import ModelError
+from .lora import with_lora
 
 __all__ = ["to_clip", "to_controlnet", "to_model", "to_vae"]
 
@@ -110,7 +111,7 @@ def to_model(mini: MiniModel, lora_scale: float) -> Any:
         return patcher
     if mini.lora is None:
         raise ModelError("mini model's exposure LoRA", "is not in this package; set lora_scale to 0")
-    return comfy.sd.load_lora_for_models(patcher, None, mini.lora, lora_scale, 0)[0]
+    return with_lora(patcher, mini.lora, lora_scale, "mini model's exposure LoRA")
 
 
 def _controlnet_names(weights: Weights, config: dict[str, Any]) -> dict[str, str]:

@@ -6,19 +6,24 @@ ComfyUI's IMAGE is (B, H, W, C) floats, display-encoded by convention though nev
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import torch
 from comfy_api.latest import io
 
 from ..dl_core.errors import ImageError, OptionError
 
-__all__ = ["CATEGORY", "BallSocket", "as_rgb", "parse_evs"]
+__all__ = ["CATEGORY", "BallSocket", "as_rgb", "named_output", "parse_evs"]
 
 CATEGORY: Final = "LightProbe"
 
 BallSocket = io.Custom("BALL")
 """A `dl_core.ball.Ball`: where the ball sits on the canvas."""
+
+
+def named_output(kind: Any, name: str, tooltip: str, *, is_list: bool = False) -> Any:
+    """An output that is shown by its name: ComfyUI shows the type by default, and wants ids no input has."""
+    return kind.Output(f"{name}_out", display_name=name, tooltip=tooltip, is_output_list=is_list)
 
 
 def as_rgb(image: torch.Tensor, socket: str) -> torch.Tensor:
