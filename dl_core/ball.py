@@ -8,6 +8,7 @@ camera (visualized as white) and in an inpaint mask").
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,13 +66,8 @@ def place_ball(
         raise OptionError("canvas", canvas, "a multiple of 8, at least 64 pixels")
     if not 16 <= diameter <= canvas:
         raise OptionError("diameter", diameter, f"16 to {canvas} pixels, the side of the canvas")
-    left = round((canvas / 2 if x is None else x) - diameter / 2)
-    top = round((canvas / 2 if y is None else y) - diameter / 2)
-    for name, value, start in (("x", x, left), ("y", y, top)):
-        if not 0 <= start <= canvas - diameter:
-            raise OptionError(
-                name, value, f"{diameter / 2:g} to {canvas - diameter / 2:g}, so that the ball is on the canvas"
-            )
+    left = _first_pixel("x", x, canvas, diameter)
+    top = _first_pixel("y", y, canvas, diameter)
     if dilation is None:
         dilation = max(1, round(canvas * 10 / 1024))
     if not 0 <= dilation <= canvas // 2:
@@ -79,7 +75,16 @@ def place_ball(
     return Ball(left, top, diameter, canvas, dilation)
 
 
-def fit_canvas(image_ldr: Image, canvas: int) -> Image:
+def _first_pixel(name: str, centre: float | None, canvas: int, diameter: int) -> int:
+    """First row or column of a ball's square whose centre is asked for, nearest whole pixel."""
+    start = (canvas / 2 if centre is None else centre) - diameter / 2
+    if not math.isfinite(start) or not 0 <= round(start) <= canvas - diameter:
+        accepted = f"{diameter / 2:g} to {canvas - diameter / 2:g}, so that the ball is on the canvas"
+        raise OptionError(name, centre, accepted)
+    return round(start)
+
+
+def fit_canvas(image_ldr: Image, canvas: int) -> Float[Tensor, "b side side c"]:
     """Fit a photograph into a square canvas, keeping its aspect, with black bars (Lanczos, as the authors' code).
 
     Args:
@@ -104,7 +109,7 @@ def fit_canvas(image_ldr: Image, canvas: int) -> Image:
     return result.to(image_ldr.device)
 
 
-def _lanczos(image: Image, height: int, width: int) -> Image:
+def _lanczos(image: Image, height: int, width: int) -> Float[Tensor, "b rows columns c"]:
     """Resize in float: Pillow resamples one plane of 32-bit values at a time."""
     planes = image.permute(0, 3, 1, 2).detach().cpu().float().numpy()
     resized = [
@@ -126,7 +131,7 @@ def disc_mask(ball: Ball, *, grow: float = 0.0) -> Mask:
     return (squared <= (ball.diameter / 2 + grow) ** 2).float()[None]
 
 
-def paint_depth(depth: Image | None, ball: Ball) -> Image:
+def paint_depth(depth: Image | None, ball: Ball) -> Float[Tensor, "b side side 3"]:
     """Paint the ball nearest (white) on a depth map for a depth ControlNet.
 
     Args:
@@ -157,7 +162,7 @@ def crop_ball(image: Image, ball: Ball) -> BallImage:
     return image[:, ball.top : ball.top + ball.diameter, ball.left : ball.left + ball.diameter]
 
 
-def paste_ball(image: Image, crop: BallImage, ball: Ball) -> Image:
+def paste_ball(image: Image, crop: Float[Tensor, "n d d c"], ball: Ball) -> Image:
     """Paste a ball crop on canvas images through the hard disc (paper, Algorithm 1, line 12).
 
     Args:

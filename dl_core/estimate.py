@@ -8,10 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from .ball import Ball, fit_canvas, paint_depth, paste_ball, place_ball
 from .errors import ImageError, OptionError
-from .exposure import check_evs, merge_bracket
+from .exposure import check_evs, check_merge, merge_bracket
 from .geometry import ball_to_latlong
 from .iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
 from .painter import Observer, Painter, PaintRequest
@@ -65,7 +67,7 @@ class Probe:
     latlong_hdr: Latlong
     ball_hdr: BallImage
     exposures: tuple[IterativeResult, ...]
-    composite_ldr: Image
+    composite_ldr: Float[Tensor, "b s s c"]
     ball: Ball
     settings: Settings
     evaluations: int
@@ -79,6 +81,8 @@ def check_photograph(photo_ldr: Image) -> Image:
     """
     if photo_ldr.ndim != 4 or photo_ldr.shape[0] != 1 or photo_ldr.shape[3] != 3:
         raise ImageError("photograph", f"has shape {tuple(photo_ldr.shape)}, (1, height, width, 3) is accepted")
+    if photo_ldr.numel() == 0:
+        raise ImageError("photograph", f"is empty ({photo_ldr.shape[2]} x {photo_ldr.shape[1]})")
     if not torch.isfinite(photo_ldr).all():
         raise ImageError("photograph", "holds NaN or infinite values")
     low, high = float(photo_ldr.min()), float(photo_ldr.max())
@@ -97,7 +101,7 @@ def estimate(
     painter: Painter,
     settings: Settings,
     *,
-    depth: Image | None = None,
+    depth: Float[Tensor, "1 y x k"] | None = None,
     observer: Observer | None = None,
 ) -> Probe:
     """Estimate the light of a photograph.
@@ -116,6 +120,7 @@ def estimate(
     """
     photo_ldr = check_photograph(photo_ldr)
     evs = check_evs(settings.evs)
+    check_merge(settings.merge)
     if settings.height < 2:
         raise OptionError("height", settings.height, "2 or more rows")
     ball = place_ball(settings.canvas, settings.diameter, x=settings.x, y=settings.y)

@@ -24,6 +24,7 @@ __all__ = [
     "MERGES",
     "auto_exposure",
     "check_evs",
+    "check_merge",
     "decode_display",
     "encode_display",
     "expose",
@@ -180,6 +181,17 @@ MERGES: Final[dict[str, Callable[..., Tensor]]] = {"channel": merge_channel, "pa
 """Merge methods by name, the default first."""
 
 
+def check_merge(method: str) -> str:
+    """The name of a merge method, checked before anything is painted for it.
+
+    Raises:
+        OptionError: an unknown method.
+    """
+    if method not in MERGES:
+        raise OptionError("merge", method, ", ".join(MERGES))
+    return method
+
+
 def merge_bracket(
     balls: Sequence[Tensor], evs: Sequence[float], method: str = "channel", gamma: float = GAMMA
 ) -> Tensor:
@@ -188,6 +200,4 @@ def merge_bracket(
     Raises:
         OptionError: an unknown method, and what the method raises.
     """
-    if method not in MERGES:
-        raise OptionError("merge method", method, ", ".join(MERGES))
-    return MERGES[method](balls, evs, gamma)
+    return MERGES[check_merge(method)](balls, evs, gamma)

@@ -11,14 +11,18 @@ covers 4 / R² sr. The centre reflects what is behind the camera; the whole rim 
 
 Resampling averages several bilinear samples spread over each output pixel, weighted by solid angle, which is what
 keeps energy: a single sample aliases wherever the footprint of an output pixel is long and thin (near the rim).
+Bilinear samples are a partition of unity, so the interior of a ball keeps its energy by itself; the rim, where the
+outer 5% of the radius hold a tenth of the sphere, keeps it by weights fitted to that end (`_rim_weights`).
 
-Source: DiffusionLight, Sec. 4 and Fig. 3; the equal-area property follows from dω = 4 cos θ dA for a unit sphere.
+Sources: DiffusionLight, Sec. 4 and Fig. 3; the equal-area property follows from dω = 4 cos θ dA for a unit sphere;
+the rim's weights from Sinkhorn and Knopp, Concerning nonnegative matrices and doubly stochastic matrices (1967).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -57,6 +61,16 @@ def _require_samples(samples: int) -> None:
         raise OptionError("samples", samples, "1 to 64 samples along each side of a pixel")
 
 
+def _require_height(height: int) -> None:
+    if height < 1:
+        raise OptionError("height", height, "1 or more rows")
+
+
+def _require_radius(radius: float) -> None:
+    if not radius > 0:
+        raise OptionError("radius", radius, "a radius above 0 pixels")
+
+
 def _subpixels(count: int, samples: int, device: torch.device | None = None) -> Float[Tensor, "n"]:
     """Positions, in pixels, of `samples` evenly spread samples in each of `count` pixels."""
     return (torch.arange(count * samples, device=device, dtype=torch.float32) + 0.5) / samples
@@ -86,8 +100,7 @@ def latlong_directions(height: int, *, device: torch.device | None = None) -> Fl
     Raises:
         OptionError: height below 1.
     """
-    if height < 1:
-        raise OptionError("height", height, "1 or more rows")
+    _require_height(height)
     v = _subpixels(height, 1, device) / height
     u = _subpixels(2 * height, 1, device) / (2 * height)
     return _spherical(u[None, :].expand(height, -1), v[:, None].expand(-1, 2 * height))
@@ -102,7 +115,7 @@ def latlong_coordinates(directions: Directions) -> tuple[Float[Tensor, "*n"], Fl
         directions: (..., 3), of any length above zero.
     """
     x, y, z = directions.unbind(-1)
-    u = torch.atan2(x, -z) / (2 * math.pi) + 0.5
+    u = torch.atan2(x, 0.0 - z) / (2 * math.pi) + 0.5  # 0 - z: the azimuth of -0.0 is half a turn
     v = torch.atan2(torch.hypot(x, z), y) / math.pi
     return u, v
 
@@ -125,7 +138,7 @@ def latlong_energy(latlong: Latlong) -> Float[Tensor, "b c"]:
     return (latlong.double() * weights[None, :, :, None]).sum(dim=(1, 2)).to(latlong.dtype)
 
 
-def _pad_sphere(latlong: Latlong) -> Latlong:
+def _pad_sphere(latlong: Latlong) -> Float[Tensor, "b h+2 w+2 c"]:
     """Add one pixel on each side: around the seam, and over the poles (half a turn away)."""
     half = latlong.shape[2] // 2
     over_north = torch.roll(latlong[:, :1], half, dims=2)
@@ -171,6 +184,7 @@ def rotate_latlong(latlong: Latlong, rotation: Float[Tensor, "3 3"], *, samples:
 
 def _gather_latlong(look_up: Callable[[Tensor], Tensor], height: int, samples: int, device: torch.device) -> Latlong:
     """Average `look_up(directions)` over each pixel of a map, weighted by solid angle. Row strips bound memory."""
+    _require_height(height)
     _require_samples(samples)
     rows_per_strip = max(1, (1 << 20) // (2 * height * samples * samples))
     v = _subpixels(height, samples, device) / height
@@ -254,21 +268,33 @@ def ball_coverage(
 
 def _crop_disc(columns: Tensor, rows: Tensor, radius: float, centre: tuple[float, float]) -> Float[Tensor, "r c 2"]:
     """Disc coordinates of a grid of pixel positions in a crop; longer than 1 outside the ball."""
-    if radius <= 0:
-        raise OptionError("radius", radius, "a radius above 0 pixels")
+    _require_radius(radius)
     x = (columns - centre[0]) / radius
     y = (centre[1] - rows) / radius
     return torch.stack((x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x))), dim=-1)
 
 
-def latlong_to_ball(latlong: Latlong, size: int, *, radius: float | None = None, samples: int = 4) -> BallImage:
+def _ball_samples(height: int, radius: float) -> int:
+    """Samples along a side of a ball pixel so that six fall on each map pixel at the ball's centre.
+
+    Fewer lose up to half a percent of the energy of a sun one map pixel wide.
+    """
+    map_pixel, ball_pixel = math.pi / height, 2 / radius
+    return min(64, max(2, math.ceil(6 * ball_pixel / map_pixel)))
+
+
+def latlong_to_ball(
+    latlong: Latlong, size: int, *, radius: float | None = None, samples: int | None = None
+) -> BallImage:
     """The mirror ball that an orthographic viewer sees in the light of a map.
 
     Args:
         latlong: (B, H, 2H, C), normally linear radiance.
         size: side of the square crop in pixels; the ball is centred in it.
         radius: of the ball in pixels; half the crop when not given.
-        samples: samples along each side of a pixel. Those of a rim pixel that miss the ball do not count.
+        samples: samples along each side of a pixel at the centre, up to four times as many near the rim; when not
+            given, as many as keep the energy of a light one map pixel wide within 0.3%, except within 5 degrees of
+            straight ahead (3%). Those of a rim pixel that miss the ball do not count.
 
     Returns:
         (B, size, size, C); zero outside the ball.
@@ -279,19 +305,50 @@ def latlong_to_ball(latlong: Latlong, size: int, *, radius: float | None = None,
     Source: DiffusionLight, Sec. 4.2 (training pairs: a chrome ball rendered from a panorama).
     """
     _require_latlong(latlong)
-    _require_samples(samples)
     radius = size / 2 if radius is None else radius
-    positions = _subpixels(size, samples, latlong.device)
-    strips = []
-    for strip in positions.split(max(1, (1 << 20) // (size * samples * samples)) * samples):
-        disc = _crop_disc(positions, strip, radius, (size / 2, size / 2))
-        on_ball = (disc.square().sum(-1) <= 1).to(latlong)
-        values = sample_latlong(latlong, disc_directions(disc)) * on_ball[..., None]
-        shape = (len(strip) // samples, samples, size, samples)
-        total = values.reshape(values.shape[0], *shape, values.shape[-1]).sum(dim=(2, 4))
-        counted = on_ball.reshape(shape).sum(dim=(1, 3)).clamp(min=1)
-        strips.append(total / counted[None, :, :, None])
-    return torch.cat(strips, dim=1)
+    _require_radius(radius)
+    samples = _ball_samples(latlong.shape[1], radius) if samples is None else samples
+    _require_samples(samples)
+    x, y = torch.meshgrid(*[torch.arange(size, device=latlong.device) - size / 2] * 2, indexing="xy")
+    corners = torch.stack((x, -y), dim=-1).reshape(-1, 2)
+    length = torch.linalg.norm(corners + corners.new_tensor([0.5, -0.5]), dim=-1) / radius
+    ball = latlong.new_zeros(latlong.shape[0], size * size, latlong.shape[3])
+    for inner, outer, detail in _RINGS:
+        ring = torch.nonzero((length >= inner) & (length < outer)).squeeze(1)
+        ball[:, ring] = _average_ball_pixels(latlong, corners[ring], radius, min(64, round(detail * samples)))
+    return ball.unflatten(1, (size, size))
+
+
+_RINGS = ((0.0, 0.7, 1.0), (0.7, 0.92, 1.5), (0.92, 0.985, 2.5), (0.985, math.inf, 4.0))
+"""Rings of a ball (from, to, in radii) and how much finer than the centre they are sampled along a pixel's side.
+
+A radial step dr turns the reflection by 2 dr / sqrt(1 - r²): 1.4 times as far at 0.7 as at the centre, 2.6 at 0.92,
+5.8 at 0.985.
+"""
+
+
+def _average_ball_pixels(
+    latlong: Latlong, corners: Float[Tensor, "n 2"], radius: float, samples: int
+) -> Float[Tensor, "b n c"]:
+    """Mean radiance over the part on the ball of each of n pixels; 0 for a pixel off the ball.
+
+    Args:
+        latlong: the light.
+        corners: upper left corners, in pixels from the ball's centre, y up.
+        radius: of the ball in pixels.
+        samples: along each side of a pixel.
+    """
+    step = _subpixels(1, samples, latlong.device)
+    offsets = torch.stack((step[None, :].expand(samples, -1), -step[:, None].expand(-1, samples)), dim=-1).reshape(
+        -1, 2
+    )
+    batches = []
+    for batch in corners.split(max(1, (1 << 20) // samples**2)):
+        disc = (batch[:, None] + offsets) / radius
+        on_ball = (disc.square().sum(-1) <= 1).to(latlong)[..., None]
+        total = (sample_latlong(latlong, disc_directions(disc)) * on_ball).sum(dim=2)
+        batches.append(total / on_ball.sum(dim=1).clamp(min=1))
+    return torch.cat(batches, dim=1)
 
 
 def ball_to_latlong(
@@ -316,7 +373,7 @@ def ball_to_latlong(
         (B, height, 2 height, C).
 
     Raises:
-        OptionError: a crop that is not square, a radius not above 0, or samples outside 1 to 64.
+        OptionError: a crop that is not square, a height below 1, a radius not above 0, or samples outside 1 to 64.
 
     Source: DiffusionLight, Sec. 4 ("unwrapped to an environment map").
     """
@@ -325,24 +382,40 @@ def ball_to_latlong(
     size = ball.shape[1]
     radius = size / 2 if radius is None else radius
     centre = (size / 2, size / 2) if centre is None else centre
-    positions = _subpixels(size, 1, ball.device)
-    inside = _crop_disc(positions, positions, radius, centre).square().sum(-1) <= 1
-    coverage = inside.to(ball)[None, :, :, None]
-    # Beside the rim a bilinear sample reaches past the ball: weigh what is on it and leave the rest out.
-    weighted = torch.cat((ball * coverage, coverage.expand(ball.shape[0], -1, -1, -1)), dim=-1)
+    weights = _rim_weights(size, float(radius), (float(centre[0]), float(centre[1]))).to(ball)[None, :, :, None]
+    weighted = torch.cat((ball * weights, weights.expand(ball.shape[0], -1, -1, -1)), dim=-1)
 
     def reflect(directions: Tensor) -> Tensor:
-        inner = _within(disc_coordinates(directions), 1 - 0.5 / max(radius, 1.0))
-        values = _bilinear(weighted, centre[0] + radius * inner[..., 0], centre[1] - radius * inner[..., 1])
+        disc = disc_coordinates(directions)
+        values = _bilinear(weighted, centre[0] + radius * disc[..., 0], centre[1] - radius * disc[..., 1])
         return values[..., :-1] / values[..., -1:].clamp(min=1e-6)
 
     return _gather_latlong(reflect, height, samples, ball.device)
 
 
-def _within(disc: Disc, limit: float) -> Disc:
-    """Pull points beyond `limit` of the radius back to it: the outermost half pixel holds no sample of its own."""
-    length = torch.linalg.norm(disc, dim=-1, keepdim=True)
-    return disc * (limit / length.clamp(min=limit))
+@lru_cache(maxsize=16)
+@torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
+def _rim_weights(size: int, radius: float, centre: tuple[float, float], sweeps: int = 6) -> Float[Tensor, "d d"]:
+    """Pixel weights with which normalized bilinear sampling of a ball keeps its energy; 1 away from the rim.
+
+    Beside the rim a bilinear sample reaches past the ball. Leaving those pixels out and normalizing what remains
+    gives some pixels more of the sphere than the ball covers of them, others less: 1% of the energy for a scene that
+    is bright straight ahead. The weights are scaled until each pixel's share is the area the ball covers of it
+    (Sinkhorn's iteration); six sweeps bring every share within 2%, and the sum of the errors below 0.03%.
+    """
+    samples = 4 if size <= 512 else 2
+    positions = _subpixels(size, samples)
+    on_ball = (_crop_disc(positions, positions, radius, centre).square().sum(-1) <= 1).float()[None, None]
+    coverage = F.avg_pool2d(on_ball, samples)
+    tent = 1 - ((torch.arange(2 * samples) + 0.5) / samples - 1).abs()
+    kernel = (tent[:, None] * tent[None, :])[None, None]
+    weights = coverage
+    for _ in range(sweeps):
+        total = F.conv_transpose2d(weights, kernel, stride=samples, padding=samples // 2)
+        one_each = torch.where(total > 0, on_ball / total.clamp(min=1e-12), torch.zeros_like(total)) / samples**2
+        share = weights * F.conv2d(one_each, kernel, stride=samples, padding=samples // 2)
+        weights = torch.where(share > 0, weights * coverage / share.clamp(min=1e-12), weights)
+    return weights[0, 0]
 
 
 # --- camera ------------------------------------------------------------------------------------------------------
@@ -371,7 +444,7 @@ def latlong_to_perspective(
     fov: float = 60.0,
     rotation: Float[Tensor, "3 3"] | None = None,
     samples: int = 2,
-) -> Image:
+) -> Float[Tensor, "b rows columns c"]:
     """What a pinhole camera sees of a map.
 
     Args:
@@ -391,7 +464,9 @@ def latlong_to_perspective(
     extent = math.tan(math.radians(fov) / 2) * 2 / max(height, width)
     x = (_subpixels(width, samples, latlong.device) - width / 2) * extent
     y = (height / 2 - _subpixels(height, samples, latlong.device)) * extent
-    rays = torch.stack((x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x)), -torch.ones(len(y), len(x))), -1)
+    rays = torch.stack(
+        (x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x)), -torch.ones_like(x).expand(len(y), -1)), -1
+    )
     if rotation is not None:
         rays = rays @ rotation.to(rays).T
     values = sample_latlong(latlong, rays)

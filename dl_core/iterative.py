@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from .ball import paste_ball
 from .errors import OptionError
@@ -63,7 +65,7 @@ class IterativeResult:
     ball: BallImage
     median: BallImage
     spread: BallImage
-    balls: BallImage
+    balls: Float[Tensor, "n d d c"]
     evaluations: int
 
 

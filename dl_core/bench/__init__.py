@@ -1,0 +1,1 @@
+"""Measurements: what each stage of the method gains and loses, printed as tables and written as JSON."""
