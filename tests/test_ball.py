@@ -1,0 +1,156 @@
+"""Placing, masking, pasting: positions to the pixel, against counts and areas worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tolerances import assert_close
+
+from dl_core.ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, paste_ball, place_ball, require_canvas
+from dl_core.errors import ImageError, OptionError
+
+
+def test_the_papers_ball_sits_in_the_middle() -> None:
+    ball = place_ball(1024, 256)
+    assert ball == Ball(left=384, top=384, diameter=256, canvas=1024, dilation=10)
+    assert ball.centre == (512.0, 512.0)
+
+
+@given(st.integers(16, 128), st.floats(0, 1), st.floats(0, 1))
+def test_any_place_that_fits_is_kept_to_half_a_pixel(diameter: int, across: float, down: float) -> None:
+    room = 128 - diameter
+    x, y = diameter / 2 + across * room, diameter / 2 + down * room
+    ball = place_ball(128, diameter, x=x, y=y)
+    assert 0 <= ball.left <= room
+    assert 0 <= ball.top <= room
+    assert ball.centre == pytest.approx((x, y), abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"canvas": 60}, "canvas"),
+        ({"canvas": 100}, "canvas"),
+        ({"diameter": 8}, "diameter"),
+        ({"diameter": 200}, "diameter"),
+        ({"x": 10.0}, "x"),
+        ({"x": 125.0}, "x"),
+        ({"y": -3.0}, "y"),
+        ({"y": math.nan}, "y"),
+        ({"x": math.inf}, "x"),
+        ({"dilation": -1}, "dilation"),
+        ({"dilation": 65}, "dilation"),
+    ],
+)
+def test_a_ball_that_does_not_fit_is_named(options: dict[str, float], name: str) -> None:
+    with pytest.raises(OptionError) as raised:
+        place_ball(**({"canvas": 128, "diameter": 32} | options))  # type: ignore[arg-type]
+    assert raised.value.name == name
+
+
+@pytest.mark.parametrize(("diameter", "x"), [(32, None), (33, 40.5), (16, 100.0)])
+def test_the_mask_is_a_disc(diameter: int, x: float | None) -> None:
+    ball = place_ball(128, diameter, x=x)
+    mask = disc_mask(ball)[0]
+    assert set(mask.unique().tolist()) == {0.0, 1.0}
+    # Gauss's circle problem: the count differs from the area by less than the perimeter.
+    assert float(mask.sum()) == pytest.approx(math.pi * diameter**2 / 4, abs=math.pi * diameter / 4)
+    rows, columns = torch.nonzero(mask, as_tuple=True)
+    assert (float(columns.float().mean()) + 0.5, float(rows.float().mean()) + 0.5) == pytest.approx(ball.centre)
+    assert int(columns.min()) == ball.left
+    assert int(columns.max()) == ball.left + diameter - 1
+
+
+def test_growing_the_mask_adds_pixels_on_every_side() -> None:
+    ball = place_ball(128, 32, dilation=5)
+    grown = disc_mask(ball, grow=ball.dilation)[0]
+    columns = torch.nonzero(grown.any(dim=0)).squeeze(1)
+    assert (int(columns.min()), int(columns.max())) == (ball.left - 5, ball.left + 32 + 4)
+    assert bool((grown >= disc_mask(ball)[0]).all())
+
+
+@pytest.mark.parametrize(("height", "width"), [(64, 64), (60, 90), (90, 60), (1, 1), (1, 300), (300, 1), (3, 2000)])
+def test_the_photograph_keeps_its_aspect(height: int, width: int) -> None:
+    fitted = fit_canvas(torch.ones(1, height, width, 3), 64)
+    assert fitted.shape == (1, 64, 64, 3)
+    lit = fitted[0, ..., 0] > 0
+    rows, columns = int(lit.any(dim=1).sum()), int(lit.any(dim=0).sum())
+    scale = 64 / max(height, width)
+    assert (rows, columns) == (max(1, round(height * scale)), max(1, round(width * scale)))
+    assert_close(fitted[0][lit], 1.0)
+    # Bars of equal width, to a pixel.
+    assert abs(int(lit.any(dim=1).int().argmax()) - (64 - rows) / 2) <= 0.5
+    assert abs(int(lit.any(dim=0).int().argmax()) - (64 - columns) / 2) <= 0.5
+
+
+def test_a_photograph_of_the_canvas_size_is_left_alone(generator: torch.Generator) -> None:
+    photo = torch.rand(2, 64, 64, 3, generator=generator)
+    assert_close(fit_canvas(photo, 64), photo)
+
+
+def test_fitting_keeps_a_ramp_a_ramp() -> None:
+    ramp = ((torch.arange(128) + 0.5) / 128).expand(1, 128, -1)[..., None].expand(-1, -1, -1, 3)
+    fitted = fit_canvas(ramp, 64)
+    expected = (torch.arange(64) + 0.5) / 64
+    # Lanczos reproduces linear functions inside; within its 6 source pixels of an edge the window is cut.
+    assert_close(fitted[0, 32, 4:-4, 0], expected[4:-4], dtype=torch.float16)
+
+
+def test_an_empty_photograph_is_refused() -> None:
+    with pytest.raises(ImageError, match="empty"):
+        fit_canvas(torch.ones(1, 0, 4, 3), 64)
+
+
+def test_depth_paints_the_ball_nearest() -> None:
+    ball = place_ball(64, 16, x=20, y=40)
+    far_left = torch.linspace(0.2, 0.4, 64).expand(1, 64, -1)[..., None]
+    control = paint_depth(far_left, ball)
+    disc = disc_mask(ball)[0] == 1
+    assert control.shape == (1, 64, 64, 3)
+    assert_close(control[0][disc], 1.0)
+    # The rest is stretched to the full range.
+    assert float(control[0, 0, 0, 0]) == pytest.approx(0, abs=1e-6)
+    assert float(control[0, 0, -1, 0]) == pytest.approx(1, abs=1e-6)
+    assert_close(control[..., 0], control[..., 2])
+
+
+def test_without_depth_the_scene_is_far() -> None:
+    ball = place_ball(64, 16)
+    assert_close(paint_depth(None, ball)[..., 0], disc_mask(ball))
+
+
+def test_flat_depth_is_far_not_nan() -> None:
+    control = paint_depth(torch.full((1, 8, 8, 1), 3.0), place_ball(64, 16))
+    assert_close(control[0, 0], 0.0)
+
+
+def test_depth_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(ImageError, match="depth"):
+        paint_depth(torch.full((1, 8, 8, 1), math.nan), place_ball(64, 16))
+
+
+def test_paste_touches_the_disc_and_nothing_else(generator: torch.Generator) -> None:
+    ball = place_ball(64, 16, x=20, y=40)
+    photo, painted = torch.rand(2, 64, 64, 3, generator=generator), torch.rand(1, 16, 16, 3, generator=generator)
+    before = photo.clone()
+    result = paste_ball(photo, painted, ball)
+    assert torch.equal(photo, before)
+    disc = disc_mask(ball)[0] == 1
+    assert torch.equal(result[:, ~disc], photo[:, ~disc])
+    inside = crop_ball(disc_mask(ball)[..., None], ball)[0, ..., 0] == 1
+    assert torch.equal(crop_ball(result, ball)[:, inside], painted.expand(2, -1, -1, -1)[:, inside])
+
+
+def test_pasting_a_crop_back_changes_nothing(generator: torch.Generator) -> None:
+    ball = place_ball(64, 24, x=30)
+    photo = torch.rand(1, 64, 64, 3, generator=generator)
+    assert torch.equal(paste_ball(photo, crop_ball(photo, ball), ball), photo)
+
+
+def test_another_canvas_is_refused_with_both_sizes() -> None:
+    with pytest.raises(ImageError, match=r"40 x 48.*64 x 64"):
+        require_canvas(torch.ones(1, 48, 40, 3), place_ball(64, 16))

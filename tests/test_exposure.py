@@ -1,0 +1,247 @@
+"""Exposure and merge: single pixels worked out by hand, and bounds that follow from 8-bit steps."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tolerances import assert_close
+
+from dl_core.errors import ImageError, OptionError
+from dl_core.exposure import (
+    GAMMA,
+    MERGES,
+    auto_exposure,
+    check_evs,
+    check_merge,
+    decode_display,
+    encode_display,
+    expose,
+    luminance,
+    merge_bracket,
+    merge_channel,
+    merge_paper,
+    quantize,
+)
+
+PAPER_EVS = (0.0, -2.5, -5.0)
+
+
+def bracket(radiance: torch.Tensor, evs: tuple[float, ...] = PAPER_EVS) -> list[torch.Tensor]:
+    """What a perfect painter's 8-bit pictures show of radiance."""
+    return [quantize(expose(radiance, ev)) for ev in evs]
+
+
+def pixel(*rgb: float) -> torch.Tensor:
+    return torch.tensor(rgb).reshape(1, 1, 1, 3)
+
+
+def code_step(display: torch.Tensor) -> torch.Tensor:
+    """Most that rounding to 8 bits changes the radiance behind a display value: half a code times the slope."""
+    return ((display + 0.5 / 255).clamp(max=1) ** GAMMA - (display - 0.5 / 255).clamp(min=0) ** GAMMA).abs()
+
+
+# --- encoding ----------------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0, 1))
+def test_encoding_inverts(value: float) -> None:
+    assert_close(decode_display(encode_display(torch.tensor([value]))), torch.tensor([value]))
+
+
+def test_encoding_clips_both_ends() -> None:
+    assert encode_display(torch.tensor([-1.0, 0.0, 1.0, 7.0])).tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("ev", [0.0, -1.0, -2.5])
+def test_an_ev_scales_radiance_by_a_power_of_two(ev: float) -> None:
+    assert_close(decode_display(expose(torch.tensor([0.8]), ev)), torch.tensor([0.8 * 2**ev]))
+
+
+@given(st.floats(0, 1))
+def test_quantizing_is_off_by_half_a_code_at_most(value: float) -> None:
+    rounded = float(quantize(torch.tensor([value])))
+    assert abs(rounded - value) <= 0.5 / 255 + 1e-6
+    assert rounded * 255 == pytest.approx(round(rounded * 255), abs=1e-4)
+
+
+def test_luminance_of_white_is_one() -> None:
+    assert_close(luminance(torch.ones(4, 3)), 1.0)
+
+
+# --- the paper's EV 0 --------------------------------------------------------------------------------------------
+
+
+def test_auto_exposure_maps_the_percentile_to_the_target(generator: torch.Generator) -> None:
+    picture = torch.rand(1, 40, 40, 3, generator=generator) * 50
+    shown = expose(picture * auto_exposure(picture), 0.0)
+    assert float((shown > 0.9 + 1e-6).float().mean()) == pytest.approx(0.01, abs=1 / picture.numel())
+
+
+@given(st.floats(1e-3, 1e3))
+def test_auto_exposure_undoes_a_scale(factor: float) -> None:
+    picture = torch.linspace(0.01, 2, 300).reshape(1, 10, 10, 3)
+    assert auto_exposure(picture * factor) * factor == pytest.approx(auto_exposure(picture), rel=1e-5)
+
+
+def test_a_dark_picture_is_left_as_it_is() -> None:
+    assert auto_exposure(torch.zeros(1, 4, 4, 3)) == 1.0
+
+
+# --- EVs ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("evs", [(0,), (0.0, -2.5, -5.0), (0, -0.5, -40)])
+def test_descending_evs_pass(evs: tuple[float, ...]) -> None:
+    assert check_evs(evs) == evs
+
+
+@pytest.mark.parametrize(
+    "evs",
+    [
+        (),
+        (-1.0,),
+        (-2.5, 0.0),
+        (0.0, -5.0, -2.5),
+        (0.0, 0.0),
+        (0.0, 2.0),
+        (0.0, math.nan),
+        (math.nan,),
+        (0.0, -math.inf),
+    ],
+)
+@pytest.mark.parametrize("method", MERGES)
+def test_other_evs_are_named(evs: tuple[float, ...], method: str) -> None:
+    with pytest.raises(OptionError) as raised:
+        merge_bracket([torch.ones(1, 2, 2, 3)] * len(evs), evs, method)
+    assert raised.value.name == "evs"
+
+
+# --- merge: what the paper's does on single pixels ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("radiance", "merged"),
+    [
+        # White far above the bracket: the ceiling, 2^5.
+        ((100.0, 100.0, 100.0), (32.0, 32.0, 32.0)),
+        # Sodium lamp: EV 0 shows (1, 1, 0.2), of luminance 0.942; the ramp mixes 0.42 of the darker luminances in.
+        ((20.0, 6.0, 0.2), (3.4, 3.4, 0.7)),
+        # Red: a luminance of 0.29 never reaches the threshold, so the clipped channel stays clipped.
+        ((10.0, 0.1, 0.05), (1.0, 0.1, 0.05)),
+        # Warm: EV 0 shows white, EV -2.5 still clips red, so that its luminance is
+        # 0.2127 / 0.1768 + 0.7152 x 4 + 0.0722 x 1 = 4.1, below its threshold; the colour is lost.
+        ((8.0, 4.0, 1.0), (4.1, 4.1, 4.1)),
+    ],
+)
+def test_paper_merge_on_lamps(radiance: tuple[float, ...], merged: tuple[float, ...]) -> None:
+    found = merge_paper(bracket(pixel(*radiance)), PAPER_EVS)
+    torch.testing.assert_close(found, pixel(*merged), rtol=0, atol=0.05)  # half of the last digit printed
+
+
+def test_paper_merge_keeps_the_black_of_ev_0() -> None:
+    balls = [pixel(0, 0, 0), pixel(0.5, 0.5, 0.5), pixel(0.9, 0.9, 0.9)]
+    assert_close(merge_paper(balls, PAPER_EVS), 0.0)
+
+
+@given(st.lists(st.floats(0, 1), min_size=9, max_size=9))
+def test_paper_merge_keeps_the_chroma_of_ev_0(values: list[float]) -> None:
+    balls = [pixel(*values[3 * i : 3 * i + 3]) for i in range(3)]
+    merged = merge_paper(balls, PAPER_EVS)
+    assert bool(torch.isfinite(merged).all())
+    assert float(merged.min()) >= 0
+    shown = decode_display(balls[0])
+    cross = torch.linalg.cross(merged, shown)
+    assert float(cross.norm()) <= 1e-5 * float(merged.norm() * shown.norm()) + 1e-30
+
+
+# --- merge: what the channel merge recovers ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("radiance", [(20.0, 6.0, 0.2), (10.0, 0.1, 0.05), (8.0, 4.0, 1.0), (31.0, 0.02, 3.0)])
+def test_channel_merge_recovers_lamps(radiance: tuple[float, ...]) -> None:
+    found = merge_channel(bracket(pixel(*radiance)), PAPER_EVS)
+    # Between clipping of one exposure and the next, codes are at least 255 x 2^(-2.5 / 2.4) = 124: half a code is
+    # 0.4% of the display value, 2.4 times that in radiance. Below EV 0's range a code is coarser.
+    torch.testing.assert_close(found, pixel(*radiance), rtol=0.011, atol=0.0015)
+
+
+@given(st.lists(st.floats(0, 32), min_size=3, max_size=3))
+def test_channel_merge_is_within_half_a_code(values: list[float]) -> None:
+    truth = pixel(*values)
+    balls = bracket(truth)
+    exposed = [truth * 2.0**ev for ev in PAPER_EVS]
+    # An exposure has a say below its clipping, once the brighter one is past the threshold (less half a code).
+    has_say = [exposed[0] < 1, (exposed[0] > 0.89) & (exposed[1] < 1), exposed[1] > 0.89]
+    steps = [code_step(ball) * 2.0**-ev for ball, ev in zip(balls, PAPER_EVS, strict=True)]
+    bound = torch.stack([step * say for step, say in zip(steps, has_say, strict=True)]).amax(dim=0)
+    assert bool(((merge_channel(balls, PAPER_EVS) - truth).abs() <= bound + 1e-5 * (1 + truth)).all())
+
+
+def test_merge_is_exact_without_quantization(generator: torch.Generator) -> None:
+    truth = torch.rand(1, 16, 16, 3, generator=generator) ** 4 * 32
+    balls = [expose(truth, ev) for ev in PAPER_EVS]
+    # Powers of 2.4 and 1 / 2.4 in float32: some dozens of roundings, times 2^5.
+    torch.testing.assert_close(merge_channel(balls, PAPER_EVS), truth, rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("evs", [(0.0, -2.5, -5.0), (0.0, -2.5, -5.0, -7.5, -10.0), (0.0, -1.0)])
+@pytest.mark.parametrize("method", MERGES)
+def test_merge_of_grey_rises_to_its_ceiling(method: str, evs: tuple[float, ...]) -> None:
+    ceiling = 2.0 ** -evs[-1]
+    ramp = torch.logspace(-3, math.log10(2 * ceiling), 400).reshape(1, 1, -1, 1).expand(-1, -1, -1, 3)
+    merged = merge_bracket([expose(ramp, ev) for ev in evs], evs, method)[0, 0, :, 1]
+    # Monotone up to the roundings of merging each value twice.
+    assert bool((merged[1:] >= merged[:-1] * (1 - 1e-5)).all())
+    assert float(merged[-1]) == pytest.approx(ceiling, rel=1e-5)
+    below = ramp[0, 0, :, 1] < ceiling
+    torch.testing.assert_close(merged[below], ramp[0, 0, below, 1], rtol=2e-5, atol=1e-6)
+
+
+@given(st.floats(0, 32), st.floats(1, 2))
+def test_a_brighter_pixel_never_merges_darker(value: float, factor: float) -> None:
+    low, high = (merge_channel(bracket(pixel(v, v, v)), PAPER_EVS) for v in (value, value * factor))
+    # Where one exposure hands over to the next their codes may disagree by half a step of each: about 1%.
+    assert float(high.min()) >= float(low.max()) * 0.98 - 1e-6
+
+
+def test_merges_agree_where_nothing_clips(generator: torch.Generator) -> None:
+    balls = bracket(0.8 * torch.rand(1, 8, 8, 3, generator=generator))
+    # The paper's luminance round trip divides and multiplies by the same number.
+    torch.testing.assert_close(merge_paper(balls, PAPER_EVS), merge_channel(balls, PAPER_EVS), rtol=1e-4, atol=1e-6)
+
+
+def test_one_exposure_is_only_decoded(generator: torch.Generator) -> None:
+    ball = torch.rand(1, 8, 8, 3, generator=generator)
+    for method in MERGES:
+        torch.testing.assert_close(merge_bracket([ball], (0.0,), method), decode_display(ball), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", MERGES)
+@pytest.mark.parametrize(
+    ("spoiled", "reason"),
+    [
+        (torch.full((1, 2, 2, 3), math.nan), "NaN"),
+        (torch.full((1, 2, 2, 3), math.inf), "NaN or infinite"),
+        (torch.full((1, 2, 2, 3), -0.1), "negative"),
+        (torch.ones(1, 2, 3, 3), "shape"),
+    ],
+)
+def test_a_spoiled_exposure_is_named(method: str, spoiled: torch.Tensor, reason: str) -> None:
+    balls = [torch.ones(1, 2, 2, 3), spoiled, torch.ones(1, 2, 2, 3)]
+    with pytest.raises(ImageError, match=reason) as raised:
+        merge_bracket(balls, PAPER_EVS, method)
+    assert raised.value.source == "ball at EV -2.5"
+
+
+def test_one_ball_per_ev_is_wanted() -> None:
+    with pytest.raises(OptionError, match="balls"):
+        merge_channel([torch.ones(1, 2, 2, 3)], PAPER_EVS)
+
+
+def test_an_unknown_merge_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(OptionError, match="channel, paper"):
+        check_merge("median")
