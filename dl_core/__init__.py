@@ -2,3 +2,7 @@
 
 The library under the ComfyUI node pack; it never imports ComfyUI.
 """
+
+__all__ = ["__version__"]
+
+__version__ = "0.1.0"

@@ -20,7 +20,7 @@ from torch import Tensor
 from .errors import ImageError, OptionError
 from .shapes import BallImage, Image, Mask
 
-__all__ = ["Ball", "crop_ball", "disc_mask", "fit_canvas", "paint_depth", "paste_ball", "place_ball"]
+__all__ = ["Ball", "crop_ball", "disc_mask", "fit_canvas", "paint_depth", "paste_ball", "place_ball", "require_canvas"]
 
 
 @dataclass(frozen=True)

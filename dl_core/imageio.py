@@ -33,6 +33,8 @@ from .shapes import Image, Latlong
 __all__ = [
     "HALF_MAX",
     "atomic",
+    "exr_channels",
+    "is_exr",
     "read_envmap",
     "read_exr_header",
     "read_photograph",
@@ -357,15 +359,23 @@ def read_envmap(path: str | Path) -> Latlong:
         ImageError: missing, truncated, not a 2:1 map, more than 8,192 rows, no RGB, NaN, infinite or negative pixels.
     """
     path = Path(path)
-    magic = _first_bytes(path, 4)
-    if magic.startswith(b"v/1\x01"):
+    if is_exr(path):
         pixels = _read_exr(path)
-    elif magic.startswith(b"#?"):
+    elif _first_bytes(path, 2) == b"#?":
         pixels = _read_radiance(path)
     else:
         raise ImageError(path, "is neither an EXR nor a Radiance (.hdr) file")
     _require_radiance(path, pixels)
     return torch.from_numpy(pixels)[None]
+
+
+def is_exr(path: str | Path) -> bool:
+    """Whether a file starts as EXR files do.
+
+    Raises:
+        ImageError: it cannot be read.
+    """
+    return _first_bytes(Path(path), 4) == b"v/1\x01"
 
 
 def _first_bytes(path: Path, count: int) -> bytes:
@@ -391,7 +401,7 @@ def read_exr_header(path: str | Path) -> dict[str, Any]:
         ImageError: missing, or no EXR file.
     """
     path = Path(path)
-    if not _first_bytes(path, 4).startswith(b"v/1\x01"):
+    if not is_exr(path):
         raise ImageError(path, "is no EXR file")
     try:
         return dict(OpenEXR.File(str(path), header_only=True).header())
@@ -399,14 +409,31 @@ def read_exr_header(path: str | Path) -> dict[str, Any]:
         raise ImageError(path, f"is a damaged EXR file ({error})") from error
 
 
-def _read_exr(path: Path) -> NDArray[np.float32]:
-    _check_exr_header(path, read_exr_header(path))
+def exr_channels(path: str | Path) -> dict[str, str]:
+    """Channels of an EXR file's first part and what they are stored in: half, float or uint.
+
+    Raises:
+        ImageError: missing, damaged, or no EXR file.
+    """
+    names = {"float16": "half", "float32": "float", "uint32": "uint"}
+    return {name: names[str(plane.dtype)] for name, plane in _exr_planes(Path(path)).items()}
+
+
+def _exr_planes(path: Path) -> dict[str, NDArray[Any]]:
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
+        return {name: channel.pixels for name, channel in channels.items()}
     except (RuntimeError, ValueError) as error:
         raise ImageError(path, f"is a damaged or truncated EXR file ({error})") from error
-    planes = [channels[name].pixels for name in "RGB"]
-    return np.stack(planes, axis=-1).astype(np.float32)
+
+
+def _read_exr(path: Path) -> NDArray[np.float32]:
+    _check_exr_header(path, read_exr_header(path))
+    planes = _exr_planes(path)
+    kinds = sorted({str(planes[name].dtype) for name in "RGB"})
+    if not {"float16", "float32"} >= set(kinds):
+        raise ImageError(path, f"holds {', '.join(kinds)} pixels; half or float are accepted")
+    return np.stack([planes[name] for name in "RGB"], axis=-1).astype(np.float32)
 
 
 def _check_exr_header(path: Path, header: dict[str, Any]) -> None:

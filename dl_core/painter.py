@@ -7,7 +7,7 @@ node pack's ComfyPainter, and the tests' AnalyticPainter, which draws true balls
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from .ball import Ball
 from .errors import OptionError
@@ -62,6 +62,7 @@ class PaintResult:
     evaluations: int
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Hears of progress. Raising `Interrupted` from any call stops the run there."""
 
@@ -82,6 +83,7 @@ class SilentObserver:
         """Ignore it."""
 
 
+@runtime_checkable
 class Painter(Protocol):
     """Paints chrome balls."""
 

@@ -1,0 +1,113 @@
+"""The command line: `lightprobe COMMAND ...`. Commands are rows of a table and are imported only when asked for.
+
+Exit codes: 0 fine; 1 a fault of input, model or output; 2 an option that is not accepted; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol, cast, runtime_checkable
+
+from . import __version__
+from .errors import Interrupted, OptionError, ProbeError
+
+__all__ = ["COMMANDS", "Command", "CommandModule", "main"]
+
+FINE: Final = 0
+FAULT: Final = 1
+USAGE: Final = 2
+INTERRUPTED: Final = 130
+"""128 + SIGINT, as shells report it."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A sub-command.
+
+    Attributes:
+        summary: one line for the list of commands.
+        module: relative to this package; see `CommandModule` for what it provides.
+    """
+
+    summary: str
+    module: str
+
+    @property
+    def description(self) -> str:
+        """The summary as a sentence."""
+        return self.summary[:1].upper() + self.summary[1:] + "."
+
+
+@runtime_checkable
+class CommandModule(Protocol):
+    """What a command's module provides."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the options."""
+
+    def run(self, args: argparse.Namespace) -> int | None:
+        """Do it; the exit code, or None for 0. Faults are raised as `ProbeError`."""
+
+
+COMMANDS: Final[dict[str, Command]] = {
+    "estimate": Command("estimate the light of a photograph and write it as an EXR", ".commands.estimate"),
+    "spheres": Command("show diffuse and mirror spheres under an environment map", ".commands.spheres"),
+    "inspect": Command("print header, metadata and energy of an environment map", ".commands.inspect"),
+    "bench": Command("measure stages of the method against the truth", ".bench.cli"),
+    "train": Command("make training data and train the mini model or the exposure LoRA", ".training.cli"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; the exit code."""
+    try:
+        return _dispatch(list(sys.argv[1:] if argv is None else argv)) or FINE
+    except OptionError as error:
+        return _complain(error, USAGE)
+    except (KeyboardInterrupt, Interrupted):
+        return _complain("interrupted; no file is half-written", INTERRUPTED)
+    except ProbeError as error:
+        return _complain(error, FAULT)
+
+
+def _dispatch(arguments: list[str]) -> int | None:
+    chosen = next((argument for argument in arguments if argument in COMMANDS), None)
+    module = _load(COMMANDS[chosen]) if chosen and _is_there(COMMANDS[chosen]) else None
+    args = _parser(chosen, module).parse_args(arguments)
+    # argparse ends the program itself unless the command is one that is there.
+    return module.run(args) if module else None
+
+
+def _is_there(command: Command) -> bool:
+    return importlib.util.find_spec(command.module, __package__) is not None
+
+
+def _load(command: Command) -> CommandModule:
+    return cast("CommandModule", importlib.import_module(command.module, __package__))
+
+
+def _parser(chosen: str | None, module: CommandModule | None) -> argparse.ArgumentParser:
+    """All commands by name, and the options of the chosen one: the others need not be imported."""
+    parser = argparse.ArgumentParser(prog="lightprobe", description="HDR environment maps from one photograph.")
+    parser.add_argument("--version", action="version", version=f"lightprobe {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for name, command in COMMANDS.items():
+        if _is_there(command):
+            sub = commands.add_parser(name, help=command.summary, description=command.description)
+            if name == chosen and module is not None:
+                module.add_arguments(sub)
+    return parser
+
+
+def _complain(fault: object, code: int) -> int:
+    print(f"lightprobe: {fault}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

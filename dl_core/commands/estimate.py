@@ -1,0 +1,41 @@
+"""`lightprobe estimate PHOTO -o OUT.exr`: a photograph in; a light probe, the ball and a sheet of spheres out.
+
+Only the options are here, so that help comes without loading torch; names are checked against their tables by the
+run, and this text against the tables by the tests.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `estimate`."""
+    add = parser.add_argument
+    add("photo", metavar="PHOTO", help="photograph: JPEG, PNG, TIFF, WebP ...")
+    add("-o", "--output", metavar="OUT.exr", required=True, help="map to write: .exr, or .hdr")
+    add("--preset", default="balanced", help="draft, balanced or paper: from fast to thorough (default: balanced)")
+    add("--seed", type=int, default=0, help="of the first ball (default: 0)")
+    add("--evs", metavar="0,-2.5,-5", help="exposures, descending from 0 (default: the preset's)")
+    add("--merge", default="channel", help="channel, or paper: how exposures become radiance (default: channel)")
+    add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
+    add("--depth", metavar="FILE", help="depth of the photograph as a picture, near is bright (default: all far)")
+    add("--diameter", type=int, help="of the ball in canvas pixels (default: the model's)")
+    add("--x", type=float, help="column of the ball's centre on the canvas (default: the middle)")
+    add("--y", type=float, help="row of the ball's centre on the canvas (default: the middle)")
+    add(
+        "--backend", default="mini", help="mini: the model that comes along, a preview; diffusers: SDXL (default: mini)"
+    )
+    add("--model", metavar="PATH", help="diffusers: SDXL checkpoint; mini: another folder than its own")
+    add("--controlnet", metavar="PATH", help="diffusers: depth ControlNet for SDXL")
+    add("--lora", metavar="PATH", help="diffusers: exposure LoRA")
+    add("--json", action="store_true", help="print the report as JSON")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Estimate, write, report (see `estimating.run`)."""
+    from .estimating import run as estimate_and_write
+
+    estimate_and_write(args)

@@ -1,0 +1,246 @@
+"""What `lightprobe estimate` does; its options are in `estimate.py`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from tqdm import tqdm
+
+from .. import __version__
+from ..errors import OptionError
+from ..estimate import Probe, Settings, estimate, planned_evaluations
+from ..exposure import check_evs, check_merge
+from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
+from ..painter import Painter, SilentObserver
+from ..presets import preset
+from ..shapes import Image
+from ..spheres import sphere_sheet
+
+__all__ = ["BACKENDS", "Backend", "LoadedPainter", "probe_metadata", "run"]
+
+
+@dataclass(frozen=True)
+class LoadedPainter:
+    """A painter and the canvas it wants.
+
+    Attributes:
+        painter: paints balls.
+        canvas: side of the canvas, pixels.
+        diameter: of the ball, pixels, unless another is asked for.
+    """
+
+    painter: Painter
+    canvas: int
+    diameter: int
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A family of diffusion models.
+
+    Attributes:
+        summary: one line for people.
+        load: from the options `--model`, `--controlnet` and `--lora`.
+    """
+
+    summary: str
+    load: Callable[[argparse.Namespace], LoadedPainter]
+
+
+def _quiet_libraries() -> None:
+    """Leave the terminal to the progress bar: these libraries announce what they fall back to without torchvision."""
+    from diffusers.utils import logging as diffusers_logging
+    from transformers.utils import logging as transformers_logging
+
+    diffusers_logging.set_verbosity_error()
+    transformers_logging.set_verbosity_error()
+
+
+def _load_mini(args: argparse.Namespace) -> LoadedPainter:
+    for name in ("controlnet", "lora"):
+        if getattr(args, name) is not None:
+            raise OptionError(name, getattr(args, name), "nothing with the backend mini: its folder holds all of it")
+    _quiet_libraries()
+    from ..backends.diffusers_painter import DiffusersPainter
+    from ..backends.mini import MINI_FOLDER, load_mini
+
+    model = load_mini(Path(args.model) if args.model is not None else MINI_FOLDER)
+    return LoadedPainter(DiffusersPainter.from_mini(model), model.defaults.canvas, model.defaults.diameter)
+
+
+def _load_diffusers(args: argparse.Namespace) -> LoadedPainter:
+    for name in ("model", "controlnet"):
+        if getattr(args, name) is None:
+            raise OptionError(name, None, "a local file or folder; the backend diffusers downloads nothing")
+    _quiet_libraries()
+    from ..backends.diffusers_painter import DiffusersPainter
+
+    lora = None if args.lora is None else Path(args.lora)
+    painter = DiffusersPainter.from_files(Path(args.model), Path(args.controlnet), lora)
+    return LoadedPainter(painter, painter.defaults.canvas, painter.defaults.diameter)
+
+
+BACKENDS: Final[dict[str, Backend]] = {
+    "mini": Backend("the model this package brings along: a preview, not an estimate to rely on", _load_mini),
+    "diffusers": Backend("SDXL, a depth ControlNet and the exposure LoRA from local files", _load_diffusers),
+}
+
+_WRITERS: Final[dict[str, Callable[[Path, Probe, dict[str, str]], Path]]] = {
+    ".exr": lambda path, probe, metadata: write_exr(path, probe.latlong_hdr[0], metadata=metadata),
+    ".hdr": lambda path, probe, metadata: write_hdr(path, probe.latlong_hdr[0]),
+}
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    """The files of one run: the map, and what is named after it."""
+
+    map: Path
+    ball: Path
+    spheres: Path
+
+    @staticmethod
+    def beside(name: str) -> _Outputs:
+        path = Path(name)
+        if path.suffix.lower() not in _WRITERS:
+            raise OptionError("output", name, "a name that ends in " + " or ".join(_WRITERS))
+        return _Outputs(path, path.with_suffix(".ball.png"), path.with_suffix(".spheres.png"))
+
+    def require_writable(self) -> None:
+        for path in (self.map, self.ball, self.spheres):
+            require_writable(path)
+
+
+class _Progress(SilentObserver):
+    """Counts denoiser evaluations on a progress bar."""
+
+    def __init__(self, bar: tqdm[Any]) -> None:
+        self.bar = bar
+
+    def evaluated(self, count: int) -> None:
+        """Move the bar."""
+        self.bar.update(count)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Estimate, write, report. Everything that can be refused is refused before the model is loaded.
+
+    Raises:
+        ProbeError: see its tree; an option is named as on the command line.
+    """
+    start = time.perf_counter()
+    outputs = _Outputs.beside(args.output)
+    chosen = preset(args.preset)
+    evs = chosen.evs if args.evs is None else _parse_evs(args.evs)
+    backend = _choose_backend(args.backend)
+    check_merge(args.merge)
+    if not 0 <= args.seed < 2**32:
+        raise OptionError("seed", args.seed, "0 to 4294967295")
+    if not 2 <= args.height <= 4096:
+        raise OptionError("height", args.height, "2 to 4096 rows")
+    outputs.require_writable()
+    photo = read_photograph(args.photo)
+    depth = None if args.depth is None else read_photograph(args.depth)
+    loaded = backend.load(args)
+    settings = Settings(
+        rounds=chosen.rounds,
+        evs=evs,
+        seed=args.seed,
+        merge=args.merge,
+        canvas=loaded.canvas,
+        diameter=loaded.diameter if args.diameter is None else args.diameter,
+        x=args.x,
+        y=args.y,
+        height=args.height,
+    )
+    painting = time.perf_counter()
+    probe = _paint(photo, loaded.painter, settings, depth)
+    painted = time.perf_counter()
+    written = _write(outputs, probe, {"lightprobe:preset": args.preset, "lightprobe:backend": args.backend})
+    _report(args, probe, written, {"total": time.perf_counter() - start, "painting": painted - painting})
+
+
+def _parse_evs(text: str) -> tuple[float, ...]:
+    try:
+        return check_evs([float(value) for value in text.split(",")])
+    except ValueError as error:
+        if isinstance(error, OptionError):
+            raise
+        raise OptionError("evs", text, "numbers and commas, such as 0,-2.5,-5") from error
+
+
+def _choose_backend(name: str) -> Backend:
+    if name not in BACKENDS:
+        raise OptionError("backend", name, ", ".join(BACKENDS))
+    return BACKENDS[name]
+
+
+def _paint(photo: Image, painter: Painter, settings: Settings, depth: Image | None) -> Probe:
+    with tqdm(total=planned_evaluations(painter, settings), unit="eval", desc="denoising", file=sys.stderr) as bar:
+        return estimate(photo, painter, settings, depth=depth, observer=_Progress(bar))
+
+
+def probe_metadata(probe: Probe) -> dict[str, str]:
+    """What a file should say about how its light was estimated: EXR string attributes by name."""
+    settings, rounds = probe.settings, probe.settings.rounds
+    schedule = f"N={rounds.balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}"
+    return {
+        "lightprobe:software": f"ComfyUI-LightProbe {__version__}",
+        "lightprobe:method": f"DiffusionLight iterative inpainting, {schedule}, merge {settings.merge}",
+        "lightprobe:evs": ", ".join(f"{ev:g}" for ev in settings.evs),
+        "lightprobe:seed": str(settings.seed),
+        "lightprobe:nfe": str(probe.evaluations),
+        "lightprobe:axes": "centre -Z (where the camera looked), right of it +X, up +Y",
+    }
+
+
+def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]:
+    balls = [exposure.ball for exposure in probe.exposures]
+    sheet = sphere_sheet(probe.latlong_hdr, composite_ldr=probe.composite_ldr, balls_ldr=balls, evs=probe.settings.evs)
+    write_map = _WRITERS[outputs.map.suffix.lower()]
+    return [
+        write_map(outputs.map, probe, probe_metadata(probe) | extra),
+        write_png(outputs.ball, balls[0][0]),
+        write_png(outputs.spheres, sheet),
+    ]
+
+
+def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds: dict[str, float]) -> None:
+    memory = _peak_memory()
+    if args.json:
+        report = {
+            "written": [str(path) for path in written],
+            "evaluations": probe.evaluations,
+            "seconds": {name: round(value, 3) for name, value in seconds.items()},
+            "peak_memory_bytes": memory,
+            "preset": args.preset,
+            "backend": args.backend,
+            "merge": args.merge,
+            "evs": list(probe.settings.evs),
+            "seed": args.seed,
+            "version": __version__,
+        }
+        print(json.dumps(report, indent=2))
+        return
+    for path, what in zip(written, ("environment map", "ball at EV 0", "ball, map and spheres"), strict=True):
+        print(f"{path}  ({what}, {path.stat().st_size / 1e3:.0f} kB)")
+    peak = "" if memory is None else f", {memory / 2**30:.2f} GiB at the peak"
+    took = f"{seconds['painting']:.1f} s, {seconds['total']:.1f} s in all"
+    print(f"{probe.evaluations} denoiser evaluations in {took}{peak}")
+
+
+def _peak_memory() -> int | None:
+    """Largest resident size of this process so far, bytes; None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

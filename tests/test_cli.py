@@ -1,0 +1,338 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from PIL import Image as PILImage
+
+from dl_core import __version__, cli
+from dl_core.commands import estimate, estimating
+from dl_core.errors import Interrupted, ModelError
+from dl_core.exposure import MERGES, encode_display, expose
+from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_ball
+from dl_core.imageio import read_envmap, write_exr, write_hdr
+from dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+from dl_core.presets import PRESETS
+
+DRAFT = PRESETS["draft"]
+
+
+def sun_and_sky() -> torch.Tensor:
+    """(1, 64, 128, 3): a gradient, and a lamp of radiance 8 to the right, two stops above what EV 0 shows."""
+    directions = latlong_directions(64)
+    lamp = (directions @ torch.tensor([0.8, 0.6, 0.0]) > 0.95).float()[..., None] * 8
+    return (0.3 + 0.2 * directions[..., 1:2] + lamp).expand(-1, -1, 3)[None] * torch.tensor([1.0, 0.8, 0.6])
+
+
+@dataclass(frozen=True)
+class TruePainter:
+    """Paints the ball of a known map without error; one evaluation a step."""
+
+    latlong: torch.Tensor
+    on_step: Callable[[], None] = lambda: None
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        for _ in range(self.evaluations(len(request.seeds), request.steps, request.strength)):
+            self.on_step()
+            observer.evaluated(1)
+        ball = expose(latlong_to_ball(self.latlong, request.ball.diameter), request.ev)
+        return PaintResult(ball.expand(len(request.seeds), -1, -1, -1), self.evaluations(len(request.seeds), 6, 1))
+
+    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+        return balls * (steps - first_step(steps, strength))
+
+
+@pytest.fixture
+def backend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Adds a row `true` to the table of backends: a painter on a 256 pixel canvas."""
+
+    def add(on_step: Callable[[], None] = lambda: None, load_error: BaseException | None = None) -> None:
+        def load(args: object) -> estimating.LoadedPainter:
+            if load_error is not None:
+                raise load_error
+            return estimating.LoadedPainter(TruePainter(sun_and_sky(), on_step), 256, 128)
+
+        monkeypatch.setitem(estimating.BACKENDS, "true", estimating.Backend("paints the truth", load))
+
+    return add
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    path = tmp_path / "in" / "photo.png"
+    path.parent.mkdir()
+    PILImage.fromarray(np.full((30, 40, 3), 90, np.uint8)).save(path)
+    return path
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    return folder
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def run(photo: Path, out: Path, *options: str) -> int:
+    return cli.main(
+        ["estimate", str(photo), "-o", str(out / "a.exr"), "--preset", "draft", "--backend", "true", *options]
+    )
+
+
+# --- estimate ---
+
+
+def test_estimate_writes_a_probe_a_ball_and_a_sheet(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend()
+    assert run(photo, out, "--seed", "7") == 0
+    assert names(out) == ["a.ball.png", "a.exr", "a.spheres.png"]
+    printed = capsys.readouterr()
+    evaluations = 3 * DRAFT.rounds.balls * DRAFT.rounds.steps
+    for name in names(out):
+        assert str(out / name) in printed.out
+    assert f"{evaluations} denoiser evaluations" in printed.out
+    assert f"{evaluations}/{evaluations}" in printed.err  # the bar ended at the planned total
+
+    header = OpenEXR.File(str(out / "a.exr"), header_only=True).header()
+    assert header["envmap"] == OpenEXR.ENVMAP_LATLONG
+    assert header["lightprobe:software"] == f"ComfyUI-LightProbe {__version__}"
+    assert header["lightprobe:evs"] == "0, -2.5, -5"
+    assert header["lightprobe:seed"] == "7"
+    assert header["lightprobe:nfe"] == str(evaluations)
+    assert header["lightprobe:preset"] == "draft"
+    assert "merge channel" in header["lightprobe:method"]
+
+
+def test_the_map_is_the_light_that_was_painted(backend: Callable[..., None], photo: Path, out: Path) -> None:
+    """A painter that makes no mistake: the written map holds the truth's energy, and its lamp on the right."""
+    backend()
+    assert run(photo, out) == 0
+    written, truth = read_envmap(out / "a.exr"), sun_and_sky()
+    assert written.shape == (1, 256, 512, 3)
+    # A 128 pixel ball: 1.8 degrees a pixel, and the outer two pixels hold a sixteenth of the sphere.
+    torch.testing.assert_close(latlong_energy(written), latlong_energy(truth), rtol=0.01, atol=0)
+    brightest = latlong_directions(256).reshape(-1, 3)[written.sum(-1).argmax()]
+    assert brightest @ torch.tensor([0.8, 0.6, 0]) > 0.94
+    ball = np.array(PILImage.open(out / "a.ball.png"))
+    assert ball.shape == (128, 128, 3)
+    expected = encode_display(latlong_to_ball(truth, 128))[0].numpy()
+    assert np.abs(ball / 255 - expected).max() <= 0.5 / 255 + 1e-6
+
+
+def test_options_reach_the_estimate(backend: Callable[..., None], photo: Path, out: Path) -> None:
+    backend()
+    assert run(photo, out, "--evs", "0,-4", "--merge", "paper", "--height", "32", "--diameter", "64", "--x", "50") == 0
+    assert read_envmap(out / "a.exr").shape == (1, 32, 64, 3)
+    header = OpenEXR.File(str(out / "a.exr"), header_only=True).header()
+    assert header["lightprobe:evs"] == "0, -4"
+    assert "merge paper" in header["lightprobe:method"]
+    assert PILImage.open(out / "a.ball.png").size == (64, 64)
+
+
+def test_radiance_output_and_depth(backend: Callable[..., None], photo: Path, out: Path) -> None:
+    backend()
+    argv = ["estimate", str(photo), "-o", str(out / "a.hdr"), "--preset", "draft", "--backend", "true"]
+    assert cli.main([*argv, "--depth", str(photo)]) == 0
+    assert names(out) == ["a.ball.png", "a.hdr", "a.spheres.png"]
+    assert read_envmap(out / "a.hdr").shape == (1, 256, 512, 3)
+
+
+def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    backend()
+    assert run(photo, out, "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["written"] == [str(out / name) for name in ("a.exr", "a.ball.png", "a.spheres.png")]
+    assert report["evaluations"] == 3 * DRAFT.rounds.balls * DRAFT.rounds.steps
+    assert report["seconds"]["total"] >= report["seconds"]["painting"] > 0
+    assert report["evs"] == [0, -2.5, -5]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--preset", "fast"], "preset is 'fast'; accepted: draft, balanced, paper"),
+        (["--evs", "0,-2,-2"], "evs is"),
+        (["--evs", "-1,-2"], "evs"),
+        (["--evs=1,0"], "evs is"),
+        (["--evs", "0;-2"], "evs is '0;-2'; accepted: numbers and commas"),
+        (["--evs", "0,nan"], "evs is"),
+        (["--evs", ""], "evs is ''"),
+        (["--merge", "mean"], "merge is 'mean'; accepted: channel, paper"),
+        (["--backend", "flux"], "backend is 'flux'; accepted: mini, diffusers"),
+        (["--seed", "-1"], "seed is -1; accepted: 0 to 4294967295"),
+        (["--height", "0"], "height is 0"),
+        (["--diameter", "300"], "diameter is 300; accepted: 16 to 256"),
+        (["--x", "10"], "x is 10.0; accepted: 64 to 192"),
+        (["--seed", "one"], "--seed"),
+        (["-o", "a.png"], "output is 'a.png'; accepted: a name that ends in .exr or .hdr"),
+        (["--backend", "diffusers"], "model is None; accepted: a local file"),
+        (["--backend", "mini", "--lora", "x"], "lora is 'x'; accepted: nothing with the backend mini"),
+    ],
+)
+def test_options_that_are_not_accepted_exit_with_2(
+    backend: Callable[..., None],
+    photo: Path,
+    out: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    message: str,
+) -> None:
+    backend()
+    try:
+        code = run(photo, out, *options)
+    except SystemExit as left:  # argparse's own
+        code = left.code
+    assert code == 2
+    assert message in capsys.readouterr().err
+    assert names(out) == []
+
+
+def test_faults_exit_with_1(
+    backend: Callable[..., None], photo: Path, out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend(load_error=ModelError("unet.safetensors", "no such model file"))
+    assert run(photo, out) == 1
+    assert "unet.safetensors: no such model file" in capsys.readouterr().err
+    assert run(tmp_path / "gone.jpg", out) == 1
+    assert "gone.jpg" in capsys.readouterr().err
+    assert names(out) == []
+
+
+def test_the_output_is_checked_before_anything_is_loaded(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend(load_error=AssertionError("loaded"))
+    assert run(photo, out / "gone") == 1
+    assert f"the folder {out / 'gone'} does not exist" in capsys.readouterr().err
+    (out / "a.spheres.png").mkdir()
+    assert run(photo, out) == 1
+    assert "a.spheres.png: is a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("step", [1, 30, 54])
+@pytest.mark.parametrize("event", [KeyboardInterrupt(), Interrupted("stopped")])
+def test_interruption_leaves_nothing_half_written(
+    backend: Callable[..., None], photo: Path, out: Path, step: int, event: BaseException
+) -> None:
+    left = [step]
+
+    def stop() -> None:
+        left[0] -= 1
+        if left[0] == 0:
+            raise event
+
+    backend(stop)
+    (out / "a.exr").write_text("an earlier result")
+    assert run(photo, out) == 130
+    assert names(out) == ["a.exr"]
+    assert (out / "a.exr").read_text() == "an earlier result"
+
+
+# --- spheres and inspect ---
+
+
+def test_spheres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, picture = tmp_path / "map.exr", tmp_path / "spheres.png"
+    write_exr(source, sun_and_sky()[0], metadata={})
+    assert cli.main(["spheres", str(source), "-o", str(picture), "--size", "64"]) == 0
+    assert capsys.readouterr().out.strip() == str(picture)
+    assert PILImage.open(picture).size == (4 * 64 + 4 * 16, 64 + 24 + 2 * 16)
+    assert cli.main(["spheres", str(source), "-o", str(picture), "--albedo", "2"]) == 2
+    assert cli.main(["spheres", str(source), "-o", str(picture), "--size", "1"]) == 2
+    assert cli.main(["spheres", str(tmp_path / "gone.exr"), "-o", str(picture)]) == 1
+
+
+def test_inspect_tells_energy_and_where_the_light_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A uniform map of radiance (1, 2, 3) holds 4π times that; one brighter pixel is found where it was put."""
+    uniform = torch.tensor([1.0, 2, 3]).expand(16, 32, 3).clone()
+    uniform[3, 24] *= 1 + 1e-3
+    write_exr(tmp_path / "a.exr", uniform, metadata={"lightprobe:seed": "5"}, half=False)
+    assert cli.main(["inspect", str(tmp_path / "a.exr"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["channels"] == ["B float", "G float", "R float"]
+    assert facts["envmap"] == "latlong"
+    assert facts["lightprobe:seed"] == "5"
+    assert facts["energy"] == pytest.approx([4 * np.pi, 8 * np.pi, 12 * np.pi], rel=1e-4)
+    assert facts["mean radiance"] == pytest.approx([1, 2, 3], rel=1e-4)
+    right, up = facts["brightest, degrees right and up"]
+    assert right == pytest.approx((24.5 / 32 - 0.5) * 360, abs=1e-3)
+    assert up == pytest.approx(90 - 3.5 / 16 * 180, abs=1e-3)
+    assert cli.main(["inspect", str(tmp_path / "a.exr")]) == 0
+    assert "size" in capsys.readouterr().out
+
+
+def test_inspect_radiance_and_what_is_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_hdr(tmp_path / "a.hdr", sun_and_sky()[0])
+    assert cli.main(["inspect", str(tmp_path / "a.hdr")]) == 0
+    assert "Radiance RGBE" in capsys.readouterr().out
+    (tmp_path / "a.txt").write_text("no map")
+    assert cli.main(["inspect", str(tmp_path / "a.txt")]) == 1
+    assert "neither an EXR nor a Radiance" in capsys.readouterr().err
+
+
+# --- the command line itself ---
+
+
+def test_help_comes_without_torch() -> None:
+    script = (
+        "import sys; from dl_core.cli import main\n"
+        "for command in ([], ['estimate'], ['spheres'], ['inspect']):\n"
+        "    try: main([*command, '--help'])\n"
+        "    except SystemExit as left: assert left.code == 0\n"
+        "assert not {'torch', 'numpy', 'diffusers', 'OpenEXR'} & set(sys.modules)"
+    )
+    root = Path(cli.__file__).parent.parent
+    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_help_names_what_the_tables_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["estimate", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for name in (*PRESETS, *MERGES, *estimating.BACKENDS):
+        assert name in text
+    assert next(iter(MERGES)) == "channel"
+    assert next(iter(estimating.BACKENDS)) == "mini"
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_declares_and_runs(name: str) -> None:
+    if not cli._is_there(cli.COMMANDS[name]):
+        pytest.skip(f"{name} is not part of this installation")
+    module = cli._load(cli.COMMANDS[name])
+    assert callable(module.add_arguments)
+    assert callable(module.run)
+    with pytest.raises(SystemExit) as left:
+        cli.main([name, "--help"])
+    assert left.value.code == 0
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["--version"])
+    assert capsys.readouterr().out.strip() == f"lightprobe {__version__}"
+
+
+def test_no_command_and_unknown_commands_exit_with_2(capsys: pytest.CaptureFixture[str]) -> None:
+    for argv in ([], ["paint"]):
+        with pytest.raises(SystemExit) as left:
+            cli.main(argv)
+        assert left.value.code == 2
+
+
+def test_estimate_module_only_holds_options() -> None:
+    assert estimate.__all__ == ["add_arguments", "run"]
