@@ -2,19 +2,25 @@
 
 ComfyUI imports torchvision at module level in model families these tests do not use, so empty modules will do. Others
 ask `importlib.util.find_spec` whether it is there and would then want its contents: they are told that it is not.
+spandrel, which cannot do without it, gets a stand-in too: ComfyUI's UpscaleModelLoader needs its names, and without that
+node the web client fails on every model loader.
 """
 
 import importlib.util
 import sys
 import types
 
+
+def _module(name, **contents):
+    module = types.ModuleType(name)
+    vars(module).update(contents)
+    sys.modules[name] = module
+    return module
+
+
 if importlib.util.find_spec("torchvision") is None:
-    torchvision = types.ModuleType("torchvision")
-    sys.modules["torchvision"] = torchvision
-    for name in ("models", "transforms"):
-        module = types.ModuleType(f"torchvision.{name}")
-        setattr(torchvision, name, module)
-        sys.modules[module.__name__] = module
+    _module("torchvision", models=_module("torchvision.models"), transforms=_module("torchvision.transforms"))
+    _module("spandrel", ModelLoader=type("ModelLoader", (), {}), ImageModelDescriptor=type("Descriptor", (), {}))
 
     find_spec = importlib.util.find_spec
 
