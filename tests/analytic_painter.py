@@ -1,0 +1,101 @@
+"""A painter that knows the light: it draws true balls of a panorama, with as much error as it is told to make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from dl_core.ball import crop_ball
+from dl_core.exposure import expose
+from dl_core.geometry import camera_rotation, latlong_to_ball, rotate_latlong
+from dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+
+GUIDED = 2
+"""Denoiser evaluations a step: with and without the prompt."""
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """How wrong the balls are.
+
+    Attributes:
+        noise: standard deviation of Gaussian noise on display values, drawn per seed.
+        disco: share of seeds whose noise leads to a faceted ball, at every EV.
+        stops: how much brighter than asked the exposures are painted, EVs below 0 only: they disagree with EV 0.
+        drift: degrees by which the scene turns per EV step down: exposures that do not align.
+        pull: how far SDEdit stays with the ball on the canvas: 0 forgets it, 1 returns it.
+        mend: share of the canvas ball's own error that SDEdit repairs on the way; a chrome ball that is nearly
+            right is drawn to the right one.
+    """
+
+    noise: float = 0.0
+    disco: float = 0.0
+    stops: float = 0.0
+    drift: float = 0.0
+    pull: float = 0.5
+    mend: float = 0.5
+
+
+@dataclass
+class AnalyticPainter:
+    """`dl_core.painter.Painter` without a network.
+
+    Attributes:
+        latlong_hdr: (1, H, 2H, 3) the light, on the scale whose EV 0 is shown.
+        flaws: how wrong the balls are.
+        requests: what was asked for, in order.
+        spent: denoiser evaluations reported to observers.
+    """
+
+    latlong_hdr: Tensor
+    flaws: Flaws = Flaws()
+    requests: list[PaintRequest] = field(default_factory=list)
+    spent: int = 0
+
+    def __post_init__(self) -> None:
+        self._true_ball = lru_cache(self._render)
+
+    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+        return GUIDED * balls * (steps - first_step(steps, strength))
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        self.requests.append(request)
+        for _ in range(first_step(request.steps, request.strength), request.steps):
+            self.spent += GUIDED * len(request.seeds)
+            observer.evaluated(GUIDED * len(request.seeds))
+        drawn = torch.cat([self._draw(request, seed) for seed in request.seeds])
+        if request.strength < 1:
+            drawn = torch.lerp(drawn, self._mended(request), self.flaws.pull)
+        return PaintResult(drawn, self.evaluations(len(request.seeds), request.steps, request.strength))
+
+    def _mended(self, request: PaintRequest) -> Tensor:
+        """The canvas' ball on its way to the true one."""
+        true = expose(self._true_ball(request.ball.diameter, self.flaws.drift * request.ev), request.ev)
+        return torch.lerp(crop_ball(request.canvas, request.ball), true, self.flaws.mend)
+
+    def _draw(self, request: PaintRequest, seed: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        ball = self._true_ball(request.ball.diameter, self.flaws.drift * request.ev)
+        if float(torch.rand((), generator=generator)) < self.flaws.disco:
+            ball = _disco(ball, generator)
+        shown = expose(ball, request.ev + self.flaws.stops * (request.ev < 0))
+        return (shown + self.flaws.noise * torch.randn(shown.shape, generator=generator)).clamp(0, 1)
+
+    def _render(self, diameter: int, turn: float) -> Tensor:
+        light = self.latlong_hdr if turn == 0 else rotate_latlong(self.latlong_hdr, camera_rotation(yaw=turn))
+        return latlong_to_ball(light, diameter, samples=4)
+
+
+def _disco(ball: Tensor, generator: torch.Generator) -> Tensor:
+    """Facets an eighth of the ball wide, each a mirror of a random tilt: it shows one place of the true ball."""
+    size, facet = ball.shape[1], max(2, ball.shape[1] // 8)
+    cells = -(-size // facet)
+    tilt = torch.randn(cells, cells, 2, generator=generator) * (size / 5)
+    centres = (torch.arange(cells) + 0.5) * facet
+    rows = (centres[:, None] + tilt[..., 0]).clamp(0, size - 1).long()
+    columns = (centres[None, :] + tilt[..., 1]).clamp(0, size - 1).long()
+    cell = torch.arange(size) // facet
+    return ball[:, rows[cell][:, cell], columns[cell][:, cell]]
