@@ -118,12 +118,14 @@ def sphere_normals(size: int, *, device: torch.device | None = None) -> Float[Te
     return torch.stack((x, y, torch.sqrt((1 - x * x - y * y).clamp(min=0))), dim=-1)
 
 
+def _shade(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
+    """The diffuse sphere, continued beyond its rim by the rim's own radiance."""
+    return gathered_irradiance(latlong_hdr, sphere_normals(size, device=latlong_hdr.device)) * (albedo / math.pi)
+
+
 def _diffuse(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
     visible = ball_coverage(size, device=latlong_hdr.device) > 0
-    result = latlong_hdr.new_zeros(latlong_hdr.shape[0], size, size, latlong_hdr.shape[3])
-    received = gathered_irradiance(latlong_hdr, sphere_normals(size, device=latlong_hdr.device)[visible])
-    result[:, visible] = received * (albedo / math.pi)
-    return result
+    return _shade(latlong_hdr, size, albedo) * visible[..., None]
 
 
 def _mirror(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
@@ -132,6 +134,11 @@ def _mirror(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
 
 MATERIALS: Final[dict[str, Callable[[Latlong, int, float], BallImage]]] = {"diffuse": _diffuse, "mirror": _mirror}
 """Spheres by material: (map, size, albedo) -> radiance. A mirror reflects everything, whatever the albedo."""
+
+
+def _require_albedo(albedo: float) -> None:
+    if not 0 <= albedo <= 1:
+        raise OptionError("albedo", albedo, "0 to 1")
 
 
 def render_spheres(
@@ -152,8 +159,7 @@ def render_spheres(
         OptionError: an unknown material, an albedo outside 0 to 1, a size below 1, or a map that is not 2:1.
     """
     names = tuple(materials)
-    if not 0 <= albedo <= 1:
-        raise OptionError("albedo", albedo, "0 to 1")
+    _require_albedo(albedo)
     if size < 1:
         raise OptionError("size", size, "1 or more pixels")
     for name in names:
@@ -204,9 +210,10 @@ def sphere_sheet(
         (rows, columns, 3) display-encoded in [0, 1].
 
     Raises:
-        OptionError: not one ball per EV.
+        OptionError: not one ball per EV, or an albedo outside 0 to 1.
         ImageError: a batch of maps.
     """
+    _require_albedo(albedo)
     if latlong_hdr.shape[0] != 1:
         raise ImageError("latlong", f"holds {latlong_hdr.shape[0]} maps; a sheet shows one")
     if len(balls_ldr) != len(evs):
@@ -220,14 +227,21 @@ def sphere_sheet(
 
 
 def _light_tiles(latlong_hdr: Latlong, size: int, albedo: float) -> list[_Tile]:
-    spheres = render_spheres(latlong_hdr, size, albedo=albedo)
+    """The map and the spheres under it, drawn for the eye: shading is smooth, so half of its pixels are computed.
+
+    The mirror takes fewer samples than `render_spheres`, whose lights keep their energy.
+    """
+    diffuse = _shade(latlong_hdr, (size + 1) // 2, albedo)
+    mirror = latlong_to_ball(latlong_hdr, size, samples=2)
     scale = auto_exposure(latlong_hdr)
-    own = min(scale, auto_exposure(spheres["diffuse"]))
+    own = min(scale, auto_exposure(diffuse))
     shift = f", EV {math.log2(own / scale):.1f}" if own < scale else ""
     return [
         _Tile("map, 99th percentile at 0.9", _fit(encode_display(latlong_hdr * scale), size, 2 * size)),
-        _Tile(f"diffuse sphere, albedo {albedo:g}{shift}", _on_background(encode_display(spheres["diffuse"] * own))),
-        _Tile("mirror sphere", _on_background(encode_display(spheres["mirror"] * scale))),
+        _Tile(
+            f"diffuse sphere, albedo {albedo:g}{shift}", _on_background(_fit(encode_display(diffuse * own), size, size))
+        ),
+        _Tile("mirror sphere", _on_background(encode_display(mirror * scale))),
     ]
 
 
