@@ -4,25 +4,27 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 import torch
+from analytic_painter import AnalyticPainter
 from PIL import Image as PILImage
 
 from dl_core import __version__, cli
 from dl_core.commands import estimate, estimating
 from dl_core.errors import Interrupted, ModelError
-from dl_core.exposure import MERGES, encode_display, expose
+from dl_core.exposure import MERGES, encode_display
 from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_ball
 from dl_core.imageio import read_envmap, write_exr, write_hdr
-from dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+from dl_core.painter import Observer, Painter, PaintRequest, PaintResult, SilentObserver
 from dl_core.presets import PRESETS
 
-DRAFT = PRESETS["draft"]
+EVALUATIONS = 2 * PRESETS["draft"].guided_steps
+"""What a draft costs, with and without the prompt."""
 
 
 def sun_and_sky() -> torch.Tensor:
@@ -32,33 +34,42 @@ def sun_and_sky() -> torch.Tensor:
     return (0.3 + 0.2 * directions[..., 1:2] + lamp).expand(-1, -1, 3)[None] * torch.tensor([1.0, 0.8, 0.6])
 
 
-@dataclass(frozen=True)
-class TruePainter:
-    """Paints the ball of a known map without error; one evaluation a step."""
+class StoppingObserver(SilentObserver):
+    """Passes progress on, and stops the run when so many evaluations are done."""
 
-    latlong: torch.Tensor
-    on_step: Callable[[], None] = lambda: None
+    def __init__(self, told: Observer, after: int, event: BaseException) -> None:
+        self.told, self.left, self.event = told, after, event
+
+    def evaluated(self, count: int) -> None:
+        self.told.evaluated(count)
+        self.left -= count
+        if self.left <= 0:
+            raise self.event
+
+
+@dataclass
+class StoppedPainter(AnalyticPainter):
+    """An AnalyticPainter that somebody stops."""
+
+    after: int = 0
+    event: BaseException = field(default_factory=KeyboardInterrupt)
+    done: int = 0
 
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
-        for _ in range(self.evaluations(len(request.seeds), request.steps, request.strength)):
-            self.on_step()
-            observer.evaluated(1)
-        ball = expose(latlong_to_ball(self.latlong, request.ball.diameter), request.ev)
-        return PaintResult(ball.expand(len(request.seeds), -1, -1, -1), self.evaluations(len(request.seeds), 6, 1))
-
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
-        return balls * (steps - first_step(steps, strength))
+        result = super().paint(request, StoppingObserver(observer, self.after - self.done, self.event))
+        self.done += result.evaluations
+        return result
 
 
 @pytest.fixture
 def backend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Adds a row `true` to the table of backends: a painter on a 256 pixel canvas."""
+    """Adds a row `true` to the table of backends: a painter without error on a 256 pixel canvas."""
 
-    def add(on_step: Callable[[], None] = lambda: None, load_error: BaseException | None = None) -> None:
+    def add(painter: Painter | None = None, load_error: BaseException | None = None) -> None:
         def load(args: object) -> estimating.LoadedPainter:
             if load_error is not None:
                 raise load_error
-            return estimating.LoadedPainter(TruePainter(sun_and_sky(), on_step), 256, 128)
+            return estimating.LoadedPainter(painter or AnalyticPainter(sun_and_sky()), 256, 128)
 
         monkeypatch.setitem(estimating.BACKENDS, "true", estimating.Backend("paints the truth", load))
 
@@ -100,18 +111,17 @@ def test_estimate_writes_a_probe_a_ball_and_a_sheet(
     assert run(photo, out, "--seed", "7") == 0
     assert names(out) == ["a.ball.png", "a.exr", "a.spheres.png"]
     printed = capsys.readouterr()
-    evaluations = 3 * DRAFT.rounds.balls * DRAFT.rounds.steps
     for name in names(out):
         assert str(out / name) in printed.out
-    assert f"{evaluations} denoiser evaluations" in printed.out
-    assert f"{evaluations}/{evaluations}" in printed.err  # the bar ended at the planned total
+    assert f"{EVALUATIONS} denoiser evaluations" in printed.out
+    assert f"{EVALUATIONS}/{EVALUATIONS}" in printed.err  # the bar ended at the planned total
 
     header = OpenEXR.File(str(out / "a.exr"), header_only=True).header()
     assert header["envmap"] == OpenEXR.ENVMAP_LATLONG
     assert header["lightprobe:software"] == f"ComfyUI-LightProbe {__version__}"
     assert header["lightprobe:evs"] == "0, -2.5, -5"
     assert header["lightprobe:seed"] == "7"
-    assert header["lightprobe:nfe"] == str(evaluations)
+    assert header["lightprobe:nfe"] == str(EVALUATIONS)
     assert header["lightprobe:preset"] == "draft"
     assert "merge channel" in header["lightprobe:method"]
 
@@ -155,7 +165,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
     assert run(photo, out, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["written"] == [str(out / name) for name in ("a.exr", "a.ball.png", "a.spheres.png")]
-    assert report["evaluations"] == 3 * DRAFT.rounds.balls * DRAFT.rounds.steps
+    assert report["evaluations"] == EVALUATIONS
     assert report["seconds"]["total"] >= report["seconds"]["painting"] > 0
     assert report["evs"] == [0, -2.5, -5]
 
@@ -222,19 +232,12 @@ def test_the_output_is_checked_before_anything_is_loaded(
     assert "a.spheres.png: is a folder" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("step", [1, 30, 54])
+@pytest.mark.parametrize("after", [1, EVALUATIONS // 2, EVALUATIONS])
 @pytest.mark.parametrize("event", [KeyboardInterrupt(), Interrupted("stopped")])
 def test_interruption_leaves_nothing_half_written(
-    backend: Callable[..., None], photo: Path, out: Path, step: int, event: BaseException
+    backend: Callable[..., None], photo: Path, out: Path, after: int, event: BaseException
 ) -> None:
-    left = [step]
-
-    def stop() -> None:
-        left[0] -= 1
-        if left[0] == 0:
-            raise event
-
-    backend(stop)
+    backend(StoppedPainter(sun_and_sky(), after=after, event=event))
     (out / "a.exr").write_text("an earlier result")
     assert run(photo, out) == 130
     assert names(out) == ["a.exr"]

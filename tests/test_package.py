@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import argparse
 import ast
-import importlib
 import importlib.metadata
+import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 import dl_core
+from dl_core.commands.estimate import add_arguments
+from dl_core.presets import PRESETS
 
 ROOT = Path(dl_core.__file__).parent
 SOURCES = sorted(path for path in ROOT.rglob("*.py"))
@@ -79,7 +83,6 @@ def test_diffusers_stays_behind_the_port(path: Path) -> None:
 
 
 def test_version_is_stated_once() -> None:
-    assert importlib.import_module("dl_core").__version__ == dl_core.__version__
     pyproject = ROOT.parent / "pyproject.toml"
     if pyproject.exists():
         assert f'version = "{dl_core.__version__}"' in pyproject.read_text(encoding="utf-8")
@@ -88,3 +91,25 @@ def test_version_is_stated_once() -> None:
     except importlib.metadata.PackageNotFoundError:
         pytest.skip("comfyui-lightprobe is not installed here")
     assert installed == dl_core.__version__
+
+
+def readme_commands() -> dict[str, str]:
+    """Commands of the README that are marked, by mark: the line below the opening fence."""
+    text = (ROOT.parent / "README.md").read_text(encoding="utf-8")
+    return dict(re.findall(r"<!-- command: (\w+) -->\n```sh\n(.+)\n```", text))
+
+
+@pytest.mark.skipif(not (ROOT.parent / "README.md").exists(), reason="an installed package has no README")
+def test_readme_commands_are_ones_that_work() -> None:
+    """The first is understood by the command line and names files that are there; CI runs the second."""
+    commands = readme_commands()
+    assert list(commands) == ["estimate", "test"]
+    words = shlex.split(commands["estimate"].split("&&")[-1])
+    assert words[0] == ".venv/bin/lightprobe"
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    args = parser.parse_args(words[2:])
+    assert (ROOT.parent / args.photo).is_file()
+    assert args.preset in PRESETS
+    assert "-c constraints.txt" in commands["estimate"]
+    assert "-c constraints.txt" in commands["test"]
