@@ -73,6 +73,12 @@ def _merge_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _geometry_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--balls", nargs="+", type=int, default=[256, 1024], metavar="PX", help="diameters (default: 256 1024)"
+    )
+
+
 BENCHES: Final[dict[str, Bench]] = {
     "merge": Bench(
         summary="what unwrap and merge lose behind a perfect painter",
@@ -107,12 +113,11 @@ BENCHES: Final[dict[str, Bench]] = {
     "geometry": Bench(
         summary="what latlong -> ball -> latlong loses",
         protocol={
-            "balls": geometry.BALLS,
             "normals": 400,
             "si_rmse": "of irradiance; one scale for all normals and channels, relative to the mean",
             "display_rmse": "of the map, gamma 2.4, clipped at EV 0",
         },
-        measure=lambda files, args: geometry.bench_geometry(files),
+        measure=lambda files, args: geometry.bench_geometry(files, args.balls),
         summarize=geometry.summarize,
         columns=(
             Column("ball (px)", "ball", "d"),
@@ -129,6 +134,7 @@ BENCHES: Final[dict[str, Bench]] = {
             Column("irradiance si-RMSE", "si_rmse", ".4f"),
             Column("display RMSE", "display_rmse", ".4f"),
         ),
+        add_arguments=_geometry_arguments,
     ),
 }
 """The benches by name; a new one is a new row."""
@@ -184,7 +190,9 @@ def report(name: str, records: list[dict[str, Any]], args: argparse.Namespace, s
     """A bench's result as it is written: protocol, environment, cost, summary and every record."""
     bench = BENCHES[name]
     known = {"bench", "json", "panoramas", "command"}
-    options = {key: value for key, value in vars(args).items() if key not in known and isinstance(value, str | int)}
+    options = {
+        key: value for key, value in vars(args).items() if key not in known and isinstance(value, str | int | list)
+    }
     return {
         "bench": name,
         "protocol": bench.protocol,

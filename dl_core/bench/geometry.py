@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any, Final
+from typing import Any
 
 from ..exposure import auto_exposure, expose
 from ..geometry import ball_coverage, ball_solid_angle, ball_to_latlong, latlong_energy, latlong_to_ball
@@ -12,10 +13,7 @@ from ..imageio import read_envmap
 from ..metrics import energy_kept, irradiance, si_rmse, spread_directions
 from ..shapes import BallImage
 
-__all__ = ["BALLS", "ball_energy", "bench_geometry", "summarize"]
-
-BALLS: Final = (256, 1024)
-"""Diameters of the balls the panoramas go through, pixels."""
+__all__ = ["ball_energy", "bench_geometry", "summarize"]
 
 
 def ball_energy(ball_hdr: BallImage) -> float:
@@ -25,8 +23,12 @@ def ball_energy(ball_hdr: BallImage) -> float:
     return float(covered.double().sum()) * ball_solid_angle(size / 2)
 
 
-def bench_geometry(panoramas: list[Path], balls: tuple[int, ...] = BALLS) -> list[dict[str, Any]]:
+def bench_geometry(panoramas: list[Path], balls: Sequence[int]) -> list[dict[str, Any]]:
     """Round trips of every panorama through balls of several diameters.
+
+    Args:
+        panoramas: files of linear radiance.
+        balls: diameters in pixels.
 
     Returns:
         One record a panorama and diameter: energy of the ball and of the map that comes back, as shares of the
