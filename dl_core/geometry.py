@@ -339,9 +339,8 @@ def _average_ball_pixels(
         samples: along each side of a pixel.
     """
     step = _subpixels(1, samples, latlong.device)
-    offsets = torch.stack((step[None, :].expand(samples, -1), -step[:, None].expand(-1, samples)), dim=-1).reshape(
-        -1, 2
-    )
+    right, down = torch.meshgrid(step, step, indexing="xy")
+    offsets = torch.stack((right, -down), dim=-1).reshape(-1, 2)
     batches = []
     for batch in corners.split(max(1, (1 << 20) // samples**2)):
         disc = (batch[:, None] + offsets) / radius
@@ -401,7 +400,8 @@ def _rim_weights(size: int, radius: float, centre: tuple[float, float], sweeps: 
     Beside the rim a bilinear sample reaches past the ball. Leaving those pixels out and normalizing what remains
     gives some pixels more of the sphere than the ball covers of them, others less: 1% of the energy for a scene that
     is bright straight ahead. The weights are scaled until each pixel's share is the area the ball covers of it
-    (Sinkhorn's iteration); six sweeps bring every share within 2%, and the sum of the errors below 0.03%.
+    (Sinkhorn's iteration). Six sweeps bring every share within 2%, and all errors together to 0.02% of a 256-pixel
+    ball, 0.1% of a 64-pixel one.
     """
     samples = 4 if size <= 512 else 2
     positions = _subpixels(size, samples)
@@ -464,9 +464,8 @@ def latlong_to_perspective(
     extent = math.tan(math.radians(fov) / 2) * 2 / max(height, width)
     x = (_subpixels(width, samples, latlong.device) - width / 2) * extent
     y = (height / 2 - _subpixels(height, samples, latlong.device)) * extent
-    rays = torch.stack(
-        (x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x)), -torch.ones_like(x).expand(len(y), -1)), -1
-    )
+    across, up = torch.broadcast_tensors(x[None, :], y[:, None])
+    rays = torch.stack((across, up, -torch.ones_like(across)), dim=-1)
     if rotation is not None:
         rays = rays @ rotation.to(rays).T
     values = sample_latlong(latlong, rays)
