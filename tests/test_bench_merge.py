@@ -78,6 +78,7 @@ def test_the_channel_merge_is_limited_by_the_bracket_alone(panoramas: Path) -> N
     # A sun above the ceiling is lost by any merge of the short bracket, less of it by the long one's.
     sun = {row: found["sun", row]["energy_kept"] for row in merge.ROWS}
     assert sun["channel"] < 0.9
+    assert sun["channel"] == pytest.approx(sun["ceiling"], abs=5e-3)
     assert sun["channel"] < sun["channel-long"] <= 1.01
     assert sun["hdr"] == pytest.approx(1, abs=5e-3)
 

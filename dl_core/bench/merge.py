@@ -77,6 +77,10 @@ ROWS: Final[dict[str, Row]] = {
         "the same, bracket to EV -10",
         lambda ball, height: ball_to_latlong(_channel(ball, LONG_EVS), height),
     ),
+    "ceiling": Row(
+        "true HDR ball clipped at the short bracket's ceiling",
+        lambda ball, height: ball_to_latlong(ball.clamp(max=2.0 ** -PAPER_EVS[-1]), height),
+    ),
     "hdr": Row("true HDR ball, our unwrap", lambda ball, height: ball_to_latlong(ball, height)),
 }
 """What is compared, in the order of the table."""
