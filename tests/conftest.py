@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import pytest
 import torch
 from hypothesis import settings
@@ -10,9 +12,18 @@ from jaxtyping import install_import_hook
 # Before anything of the library is imported: its jaxtyping annotations are checked in tests, and only there.
 install_import_hook("dl_core", "shape_checks.check")
 
+# The web client's tests talk to ComfyUI's server and to a browser; its client library comes with ComfyUI.
+HAS_AIOHTTP = importlib.util.find_spec("aiohttp") is not None
+collect_ignore = [] if HAS_AIOHTTP else ["browser"]
+
 # Two busy cores make times meaningless; a failing example is printed and can be repeated.
 settings.register_profile("suite", deadline=None, max_examples=30, derandomize=True, print_blob=True)
 settings.load_profile("suite")
+
+
+def pytest_report_header() -> list[str]:
+    """Say what is left out before anything is collected."""
+    return [] if HAS_AIOHTTP else ["lightprobe: tests/browser is left out, aiohttp is not installed"]
 
 
 @pytest.fixture
