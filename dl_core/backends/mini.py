@@ -11,6 +11,7 @@ TAESD's shape. Latents are 8 times smaller than the picture and have 4 channels,
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -26,13 +27,14 @@ from ..errors import ModelError
 
 __all__ = [
     "CONTROLNET_CONFIG",
+    "LORA_FILE",
     "MINI_FOLDER",
     "NETWORK_FILES",
     "SCHEDULER_CONFIG",
     "TEXT_CONFIG",
     "UNET_CONFIG",
-    "MiniDefaults",
     "MiniModel",
+    "ModelDefaults",
     "load_mini",
     "read_weights",
 ]
@@ -90,11 +92,11 @@ LORA_FILE: Final = "exposure_lora.safetensors"
 
 
 @dataclass(frozen=True)
-class MiniDefaults:
-    """How the mini model wants to be used; the fields of `mini.json`.
+class ModelDefaults:
+    """How a model wants to be used; for the mini model, the fields of `mini.json`.
 
     Attributes:
-        canvas: side of the canvas it was trained on, pixels.
+        canvas: side of the canvas it paints on, pixels.
         diameter: of the ball on it, pixels.
         guidance: scale of classifier-free guidance.
         control_scale: of the depth ControlNet.
@@ -127,7 +129,7 @@ class MiniModel:
     text_encoder_2: CLIPTextModelWithProjection
     tokenizer: CLIPTokenizer
     tokenizer_2: CLIPTokenizer
-    defaults: MiniDefaults
+    defaults: ModelDefaults
     lora: dict[str, torch.Tensor] | None
 
     @staticmethod
@@ -135,7 +137,7 @@ class MiniModel:
         """The architecture with random weights (global torch seed), no LoRA; tokenizer and defaults from a folder."""
         try:
             values = json.loads((folder / "mini.json").read_text())
-            defaults = MiniDefaults(**{field.name: values[field.name] for field in fields(MiniDefaults)})
+            defaults = ModelDefaults(**{field.name: values[field.name] for field in fields(ModelDefaults)})
         except (OSError, KeyError, json.JSONDecodeError) as error:
             raise ModelError(
                 folder / "mini.json", f"cannot be used as the mini model's settings ({error!r})"
@@ -182,17 +184,20 @@ def _rename_text_keys(weights: dict[str, torch.Tensor], network: nn.Module) -> d
     return {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
 
 
-def load_mini(folder: Path = MINI_FOLDER) -> MiniModel:
+def load_mini(folder: Path = MINI_FOLDER, *, without: Collection[str] = ()) -> MiniModel:
     """Load the mini model.
 
     Args:
         folder: holds `mini.json`, `tokenizer/` and the files of `NETWORK_FILES`; the exposure LoRA is optional.
+        without: networks to leave untrained, for the training of those.
 
     Raises:
         ModelError: a file is missing, unreadable, or holds another architecture.
     """
     model = MiniModel.untrained(folder)
     for name, network in model.networks().items():
+        if name in without:
+            continue
         path = folder / NETWORK_FILES[name]
         try:
             network.load_state_dict(_rename_text_keys(read_weights(path), network))

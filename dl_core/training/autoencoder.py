@@ -12,7 +12,7 @@ colour is exact, and latents for training the denoiser come from a few poolings.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import torch
 import torch.nn.functional as F
@@ -101,7 +101,7 @@ def write_closed_form_encoder(vae: AutoencoderTiny) -> None:
     """Write the weights with which a TAESD-shaped encoder computes `block_latents` (block 8)."""
     for parameter in vae.encoder.parameters():
         parameter.zero_()
-    layers = list(vae.encoder.layers)
+    layers: list[Any] = list(vae.encoder.layers)
     luma, decoding, root = torch.tensor(LUMA), _decoding_bends(), _root_bends()
     _pass_rgb(layers[0])
     for k, knot in enumerate(DECODING_KNOTS):
@@ -115,7 +115,7 @@ def write_closed_form_encoder(vae: AutoencoderTiny) -> None:
                 layer.weight[_DECODED, _KNEES + k, 1:, 1:] = 0.25 * bend
         else:
             layer.weight[_DECODED, _DECODED, 1:, 1:] = 0.25
-    gap, compress = (layer.conv for layer in layers[-4:-2])
+    gap, compress = (list(layer.conv) for layer in layers[-4:-2])
     for k, (knot, bend) in enumerate(zip(DECODING_KNOTS, decoding, strict=True)):
         gap[0].weight[_KNEES + k, _RGB, 1, 1] = luma
         gap[0].bias[_KNEES + k] = -knot
@@ -136,7 +136,7 @@ def _pass_rgb(layer: nn.Conv2d) -> None:
     layer.weight[range(3), range(3), 1, 1] = 1
 
 
-def _write_latents(layer: nn.Conv2d, luma: Tensor) -> None:
+def _write_latents(layer: Any, luma: Tensor) -> None:
     red, blue = torch.eye(3)[0], torch.eye(3)[2]
     layer.weight[0, _RGB, 1, 1] = luma * LUMA_SCALE
     layer.weight[1, _RGB, 1, 1] = (red - luma) * CHROMA_SCALE
@@ -156,7 +156,7 @@ def write_thumbnail_decoder(vae: AutoencoderTiny) -> None:
 
     Colours are then right from the first step, and training adds what lies between the blocks.
     """
-    layers = list(vae.decoder.layers)
+    layers: list[Any] = list(vae.decoder.layers)
     first, last = layers[0], layers[-1]
     inverse = torch.linalg.inv(
         torch.stack((torch.tensor(LUMA), torch.eye(3)[0] - torch.tensor(LUMA), torch.eye(3)[2] - torch.tensor(LUMA)))

@@ -19,7 +19,7 @@ from ..ball import Ball, disc_mask
 from .autoencoder import block_latents
 from .scenes import BASE_CAPTIONS, SceneSampler
 
-__all__ = ["Batch", "TextBank", "draw_batch", "time_ids", "velocity_loss"]
+__all__ = ["OFF_BALL_WEIGHT", "Batch", "TextBank", "draw_batch", "time_ids", "velocity_loss"]
 
 OFF_BALL_WEIGHT = 0.3
 """Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 
 from ..errors import ImageError, OptionError
-from ..imageio import read_envmap
+from ..imageio import read_envmap, write_exr
 from ..shapes import Latlong
 from .procedural import draw_panorama
 
-__all__ = ["load_panoramas", "panorama_files", "reduce_panorama"]
+__all__ = ["draw_scenes", "load_panoramas", "panorama_files", "reduce_panorama"]
 
 
 def panorama_files(folder: Path, split: str) -> list[Path]:
@@ -45,37 +46,43 @@ def reduce_panorama(latlong: Latlong, height: int) -> Latlong:
     return F.avg_pool2d(latlong.permute(0, 3, 1, 2), factor).permute(0, 2, 3, 1)
 
 
-def load_panoramas(folder: Path | None, *, procedural: int, height: int, cache: Path | None = None) -> Latlong:
-    """The training bank: the training split of `folder` and `procedural` drawn scenes.
+def draw_scenes(folder: Path, count: int, height: int, *, report: Callable[[str], None]) -> None:
+    """Draw procedural scenes (seeds 0 to count - 1) into a folder; those that are there already are kept.
 
-    The real maps are repeated until they are as many as the drawn ones, so that a uniform draw sees both equally.
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(count):
+        path = folder / f"scene_{seed:05d}.exr"
+        if not path.is_file():
+            write_exr(path, draw_panorama(seed, height)[0], metadata={"seed": str(seed)})
+            report(f"{path.name}: {seed + 1}/{count}")
+
+
+def load_panoramas(folder: Path | None, scenes: Path | None, *, height: int) -> Latlong:
+    """The training bank: the training split of `folder` and the drawn scenes in `scenes`.
+
+    Real maps are repeated until they are about as many as the drawn ones, so that a uniform draw sees both equally.
 
     Args:
         folder: HDR maps with a manifest; None for drawn scenes only.
-        procedural: number of drawn scenes (seeds 0, 1, …).
+        scenes: folder of `draw_scenes`; None for real maps only.
         height: rows of every map of the bank.
-        cache: file to keep drawn scenes in, since they take 0.2 s each at 128 rows.
 
     Returns:
         (N, height, 2 height, 3) linear radiance.
+
+    Raises:
+        OptionError: neither is given, or a folder holds nothing of use.
+        ImageError: a map that cannot be read.
     """
-    drawn = _draw(procedural, height, cache)
-    if folder is None:
-        return drawn
-    real = torch.cat([reduce_panorama(read_envmap(path), height) for path in panorama_files(folder, "training")])
-    return torch.cat((real.repeat(max(1, procedural // len(real)), 1, 1, 1), drawn))
-
-
-def _draw(count: int, height: int, cache: Path | None) -> Latlong:
-    if cache is not None and cache.is_file():
-        kept = torch.load(cache, weights_only=True).float()
-        if kept.shape[:2] == (count, height):
-            return kept
-    drawn = (
-        torch.cat([draw_panorama(seed, height) for seed in range(count)])
-        if count
-        else torch.zeros(0, height, 2 * height, 3)
+    drawn_files = sorted(scenes.glob("scene_*.exr")) if scenes is not None else []
+    real_files = panorama_files(folder, "training") if folder is not None else []
+    if not drawn_files and not real_files:
+        raise OptionError("panoramas", str(folder), "a folder of HDR maps, or scenes made by `lightprobe train data`")
+    repeats = max(1, len(drawn_files) // max(1, len(real_files)))
+    real, drawn = (
+        [reduce_panorama(read_envmap(path), height) for path in files] for files in (real_files, drawn_files)
     )
-    if cache is not None:
-        torch.save(drawn.half(), cache)
-    return drawn
+    return torch.cat(real * repeats + drawn)

@@ -26,7 +26,7 @@ from ..geometry import (
 )
 from ..shapes import BallImage, Image, Latlong
 
-__all__ = ["BASE_CAPTIONS", "Picture", "SceneSampler"]
+__all__ = ["BASE_CAPTIONS", "DARK_PROMPT", "NEGATIVE_PROMPT", "PROMPT", "Picture", "SceneSampler"]
 
 PROMPT: Final = "a perfect mirrored reflective chrome ball sphere"
 DARK_PROMPT: Final = "a perfect black dark mirrored reflective chrome ball sphere"
@@ -64,17 +64,27 @@ class SceneSampler:
         diameter: usual diameter of the ball, pixels.
         seed: of the whole stream.
         bracket: draw good mirror balls at EVs uniform in [ev_min, 0] (LoRA training) instead of the base's mixture.
+        centred: share of pictures with the usual ball in the middle; the rest have another size elsewhere.
         ev_min: darkest exposure.
     """
 
     def __init__(
-        self, panoramas: Latlong, canvas: int, diameter: int, seed: int, *, bracket: bool = False, ev_min: float = -5.0
+        self,
+        panoramas: Latlong,
+        canvas: int,
+        diameter: int,
+        seed: int,
+        *,
+        bracket: bool = False,
+        centred: float = 0.7,
+        ev_min: float = -5.0,
     ) -> None:
         self.panoramas = panoramas
         self.canvas = canvas
         self.diameter = diameter
         self.seed = seed
         self.bracket = bracket
+        self.centred = centred
         self.ev_min = ev_min
 
     def draw(self, index: int) -> Picture:
@@ -101,7 +111,7 @@ class SceneSampler:
             panorama = panorama.flip(2)
         return panorama * torch.exp(0.12 * torch.randn(3, generator=generator))
 
-    def _photograph(self, generator: Generator, panorama: Latlong, rotation: Tensor) -> Image:
+    def _photograph(self, generator: Generator, panorama: Tensor, rotation: Tensor) -> Image:
         """The scene fitted into the canvas with black bars, as a photograph of some aspect would be; radiance."""
         aspect = ASPECTS[int(torch.randint(len(ASPECTS), (), generator=generator))]
         width = self.canvas if aspect >= 1 else round(self.canvas * aspect)
@@ -113,8 +123,7 @@ class SceneSampler:
         return F.pad(photo, bars)
 
     def _place(self, generator: Generator) -> Ball:
-        """Mostly the usual ball in the middle; otherwise another size somewhere else."""
-        if _uniform(generator, 0, 1) < 0.7:
+        if _uniform(generator, 0, 1) < self.centred:
             return place_ball(self.canvas, self.diameter)
         diameter = 2 * round(self.diameter * _uniform(generator, 0.6, 1.1) / 2)
         reach = self.canvas - diameter

@@ -1,0 +1,331 @@
+"""A Painter on diffusers: SDXL from local files, or the embedded mini model, with a depth ControlNet.
+
+Source: DiffusionLight, Algorithm 0 (INPAINT). The authors' code departs from the listing, and so does the default
+here: what lies outside the mask is noised again with the ball's own initial noise (`impute="initial"`), where the
+listing takes the noise just predicted (`impute="predicted"`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import torch
+import torch.nn.functional as F
+from diffusers import (
+    ControlNetModel,
+    DDIMScheduler,
+    EulerDiscreteScheduler,
+    StableDiffusionXLControlNetInpaintPipeline,
+    StableDiffusionXLPipeline,
+    UniPCMultistepScheduler,
+)
+from jaxtyping import Float
+from torch import Tensor
+
+from ..ball import Ball, crop_ball, disc_mask, require_canvas
+from ..errors import ModelError, OptionError
+from ..painter import Observer, PaintRequest, PaintResult, first_step
+from ..shapes import BallImage, Image
+from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults
+
+__all__ = ["SAMPLERS", "DiffusersPainter", "Guidance", "Imputing", "ball_latent_mask"]
+
+SAMPLERS: Final[dict[str, Callable[..., Any]]] = {
+    "unipc": lambda config: UniPCMultistepScheduler.from_config(config),
+    "ddim": lambda config: DDIMScheduler.from_config(config, clip_sample=False, set_alpha_to_one=False),
+    "euler": lambda config: EulerDiscreteScheduler.from_config(config),
+}
+"""Deterministic samplers by name, the paper's first. A stochastic one would break the bond of seed and ball."""
+
+Imputing = Literal["initial", "predicted"]
+
+PAPER_DEFAULTS: Final = ModelDefaults(
+    canvas=1024,
+    diameter=256,
+    guidance=5.0,
+    control_scale=0.5,
+    lora_scale=0.75,
+    ev_min=-5.0,
+    prompt="a perfect mirrored reflective chrome ball sphere",
+    dark_prompt="a perfect black dark mirrored reflective chrome ball sphere",
+    negative_prompt="matte, diffuse, flat, dull",
+)
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """Text conditioning of one exposure: token and pooled embeddings, wanted and unwanted.
+
+    Attributes:
+        tokens: (1, 77, C).
+        pooled: (1, P).
+        negative_tokens: (1, 77, C).
+        negative_pooled: (1, P).
+    """
+
+    tokens: Tensor
+    pooled: Tensor
+    negative_tokens: Tensor
+    negative_pooled: Tensor
+
+
+def ball_latent_mask(ball: Ball, factor: int = 8) -> Float[Tensor, "1 1 m m"]:
+    """The inpaint disc at latent size, reduced bilinearly as the authors' code does (nearly binary)."""
+    side = ball.canvas // factor
+    return F.interpolate(disc_mask(ball, grow=ball.dilation)[None], size=(side, side), mode="bilinear")
+
+
+class DiffusersPainter:
+    """Paints chrome balls with a diffusers pipeline's networks.
+
+    Args:
+        pipeline: its networks, text encoders and scheduler configuration are used; its own call is not.
+        defaults: prompts, guidance, scale of ControlNet and LoRA, and the EV of the dark prompt.
+        sampler: a name of `SAMPLERS`.
+        batch: balls denoised at once; less memory with less.
+        impute: noise put on what lies outside the mask (see the module).
+    """
+
+    def __init__(
+        self,
+        pipeline: StableDiffusionXLControlNetInpaintPipeline,
+        defaults: ModelDefaults,
+        *,
+        sampler: str = "unipc",
+        batch: int = 4,
+        impute: Imputing = "initial",
+    ) -> None:
+        if sampler not in SAMPLERS:
+            raise OptionError("sampler", sampler, ", ".join(SAMPLERS))
+        if batch < 1:
+            raise OptionError("batch", batch, "1 or more")
+        if impute not in ("initial", "predicted"):
+            raise OptionError("impute", impute, "initial, predicted")
+        if impute == "predicted" and sampler == "euler":
+            raise OptionError("impute", impute, "initial, with the euler sampler")
+        self.pipeline = pipeline
+        self.defaults = defaults
+        self.sampler = sampler
+        self.batch = batch
+        self.impute = impute
+        self._guidance: dict[float, Guidance] = {}
+
+    @staticmethod
+    def from_mini(model: MiniModel, **options: Any) -> DiffusersPainter:
+        """A painter on the embedded mini model. `options` as the constructor's."""
+        pipeline = StableDiffusionXLControlNetInpaintPipeline(
+            vae=model.vae,
+            text_encoder=model.text_encoder,
+            text_encoder_2=model.text_encoder_2,
+            tokenizer=model.tokenizer,
+            tokenizer_2=model.tokenizer_2,
+            unet=model.unet,
+            controlnet=model.controlnet,
+            scheduler=UniPCMultistepScheduler(**SCHEDULER_CONFIG, timestep_spacing="leading", steps_offset=1),
+        )
+        if model.lora is not None:
+            pipeline.load_lora_weights(dict(model.lora), adapter_name="exposure")
+            pipeline.set_adapters("exposure", model.defaults.lora_scale)
+        return DiffusersPainter(pipeline, model.defaults, **options)
+
+    @staticmethod
+    def from_files(model: Path, controlnet: Path, lora: Path | None = None, **options: Any) -> DiffusersPainter:
+        """A painter on SDXL from local files; nothing is downloaded.
+
+        Args:
+            model: an SDXL checkpoint (.safetensors) or a folder in diffusers' layout.
+            controlnet: a depth ControlNet for SDXL, file or folder.
+            lora: the exposure LoRA, a file; without it the dark exposures rest on the prompt alone.
+            options: as the constructor's.
+
+        Raises:
+            ModelError: a file is missing, unreadable, or not of SDXL's architecture.
+        """
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        dtype = torch.float16 if device == "cuda" else torch.float32
+        base = _load(StableDiffusionXLPipeline, model, dtype)
+        _require_sdxl(model, base.unet)
+        control = _load(ControlNetModel, controlnet, dtype)
+        if control.config.cross_attention_dim != base.unet.config.cross_attention_dim:
+            raise ModelError(controlnet, "is not a ControlNet for SDXL (its text conditioning has another width)")
+        pipeline = StableDiffusionXLControlNetInpaintPipeline(**base.components, controlnet=control)
+        if lora is not None:
+            _load_lora(pipeline, lora)
+        return DiffusersPainter(pipeline.to(device), PAPER_DEFAULTS, **options)
+
+    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+        """See `painter.Painter`: two a ball and step, one where guidance is 1 and the negative prompt has no say."""
+        return balls * (steps - first_step(steps, strength)) * (1 if self.defaults.guidance == 1 else 2)
+
+    @torch.no_grad()
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        """See `painter.Painter`.
+
+        Raises:
+            ImageError: the canvas has not the size the ball was placed on.
+        """
+        require_canvas(request.canvas, request.ball)
+        balls, spent = [], 0
+        for start in range(0, len(request.seeds), self.batch):
+            seeds = request.seeds[start : start + self.batch]
+            latents, evaluations = self._inpaint(request, seeds, observer)
+            balls.append(self._decode_ball(latents, request.ball))
+            spent += evaluations
+        return PaintResult(torch.cat(balls), spent)
+
+    def _inpaint(self, request: PaintRequest, seeds: tuple[int, ...], observer: Observer) -> tuple[Tensor, int]:
+        """Algorithm 0 for a batch of balls; returns latents (n, 4, h, w) and the denoiser evaluations spent."""
+        scheduler = SAMPLERS[self.sampler](self.pipeline.scheduler.config)
+        scheduler.set_timesteps(request.steps, device=self._device)
+        begin = first_step(request.steps, request.strength)
+        timesteps = scheduler.timesteps[begin * scheduler.order :]
+        scheduler.set_begin_index(begin * scheduler.order)
+
+        clean, noise = self._start(request.canvas, seeds)
+        mask = ball_latent_mask(request.ball).to(clean)
+        latents = (
+            noise * scheduler.init_noise_sigma
+            if request.strength == 1
+            else scheduler.add_noise(clean, noise, timesteps[:1].expand(len(seeds)))
+        )
+        per_step = self.evaluations(len(seeds), 1, 1.0)
+        denoise = self._denoiser(request, len(seeds))
+        for i, timestep in enumerate(timesteps):
+            predicted = denoise(scheduler.scale_model_input(latents, timestep), timestep)
+            known_noise = (
+                noise if self.impute == "initial" else _predicted_noise(scheduler, predicted, latents, timestep)
+            )
+            latents = scheduler.step(predicted, timestep, latents, return_dict=False)[0]
+            last = i + 1 == len(timesteps)
+            known = clean if last else scheduler.add_noise(clean, known_noise, timesteps[i + 1].expand(len(seeds)))
+            latents = (1 - mask) * known + mask * latents
+            observer.evaluated(per_step)
+        return latents, per_step * len(timesteps)
+
+    def _start(self, canvas: Image, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        """Clean latents of the canvas and initial noise of each ball, (n, 4, h, w) each.
+
+        A sampling autoencoder draws from the ball's generator before the noise does, as in the authors' code.
+        """
+        vae = self.pipeline.vae
+        pixels = (canvas.permute(0, 3, 1, 2) * 2 - 1).to(self._device, vae.dtype)
+        encoded = vae.encode(pixels)
+        clean, noise = [], []
+        for seed in seeds:
+            generator = torch.Generator().manual_seed(seed)
+            sample = encoded.latent_dist.sample(generator) if hasattr(encoded, "latent_dist") else encoded.latents
+            clean.append(sample * vae.config.scaling_factor)
+            noise.append(torch.randn(sample.shape, generator=generator).to(sample))
+        return torch.cat(clean), torch.cat(noise)
+
+    def _denoiser(self, request: PaintRequest, count: int) -> Callable[[Tensor, Tensor], Tensor]:
+        """The guided denoiser ε(z, t, C) of Algorithm 0 with text and depth bound."""
+        guidance = self.guidance_at(request.ev)
+        scale = self.defaults.guidance
+        tokens, pooled = guidance.tokens, guidance.pooled
+        if scale != 1:
+            tokens = torch.cat((guidance.negative_tokens, tokens))
+            pooled = torch.cat((guidance.negative_pooled, pooled))
+        tokens, pooled = (part.repeat_interleave(count, dim=0) for part in (tokens, pooled))
+        side = float(request.ball.canvas)
+        ids = pooled.new_tensor([[side, side, 0, 0, side, side]]).expand(len(pooled), -1)
+        added = {"text_embeds": pooled, "time_ids": ids}
+        depth = request.depth.permute(0, 3, 1, 2).to(tokens).expand(len(tokens), -1, -1, -1)
+        unet, controlnet = self.pipeline.unet, self.pipeline.controlnet
+
+        def denoise(latents: Tensor, timestep: Tensor) -> Tensor:
+            doubled = latents if scale == 1 else torch.cat((latents, latents))
+            down, middle = controlnet(
+                doubled,
+                timestep,
+                encoder_hidden_states=tokens,
+                controlnet_cond=depth,
+                conditioning_scale=self.defaults.control_scale,
+                added_cond_kwargs=added,
+                return_dict=False,
+            )
+            predicted = unet(
+                doubled,
+                timestep,
+                encoder_hidden_states=tokens,
+                added_cond_kwargs=added,
+                down_block_additional_residuals=down,
+                mid_block_additional_residual=middle,
+                return_dict=False,
+            )[0]
+            if scale == 1:
+                return predicted
+            unwanted, wanted = predicted.chunk(2)
+            return unwanted + scale * (wanted - unwanted)
+
+        return denoise
+
+    def guidance_at(self, ev: float) -> Guidance:
+        """Embeddings at an EV: ξ(ev) = ξ_o + (ev / EV_min) (ξ_d - ξ_o), tokens and pooled alike (Sec. 4.2)."""
+        if ev not in self._guidance:
+            own, unwanted, own_pooled, unwanted_pooled = self._embed(self.defaults.prompt)
+            dark, _, dark_pooled, _ = self._embed(self.defaults.dark_prompt)
+            share = ev / self.defaults.ev_min
+            self._guidance[ev] = Guidance(
+                torch.lerp(own, dark, share), torch.lerp(own_pooled, dark_pooled, share), unwanted, unwanted_pooled
+            )
+        return self._guidance[ev]
+
+    @torch.no_grad()
+    def _embed(self, prompt: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.pipeline.encode_prompt(  # type: ignore[no-any-return]
+            prompt,
+            device=self._device,
+            do_classifier_free_guidance=True,
+            negative_prompt=self.defaults.negative_prompt,
+        )
+
+    def _decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
+        vae = self.pipeline.vae
+        pixels = vae.decode(latents.to(vae.dtype) / vae.config.scaling_factor).sample
+        canvas = (pixels.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
+        return crop_ball(canvas, ball).cpu().contiguous()
+
+    @property
+    def _device(self) -> torch.device:
+        return self.pipeline.unet.device
+
+
+def _predicted_noise(scheduler: Any, predicted: Tensor, latents: Tensor, timestep: Tensor) -> Tensor:
+    """The noise a prediction stands for, whether the model predicts noise or velocity."""
+    if scheduler.config.prediction_type == "epsilon":
+        return predicted
+    kept = scheduler.alphas_cumprod[int(timestep)].to(latents)
+    return kept.sqrt() * predicted + (1 - kept).sqrt() * latents
+
+
+def _load(kind: Any, path: Path, dtype: torch.dtype) -> Any:
+    """A diffusers model or pipeline from a local file or folder."""
+    if not path.exists():
+        raise ModelError(path, "no such file or folder")
+    try:
+        if path.is_dir():
+            return kind.from_pretrained(path, torch_dtype=dtype, local_files_only=True)
+        return kind.from_single_file(str(path), torch_dtype=dtype, local_files_only=True)
+    except Exception as error:  # diffusers raises whatever its parts do; all of it means the same to the user
+        raise ModelError(path, f"cannot be loaded as {kind.__name__} ({type(error).__name__}: {error})") from error
+
+
+def _require_sdxl(path: Path, unet: Any) -> None:
+    if getattr(unet.config, "addition_embed_type", None) != "text_time" or unet.config.in_channels != 4:
+        raise ModelError(path, "is not an SDXL base model (its UNet lacks SDXL's text-and-size conditioning)")
+
+
+def _load_lora(pipeline: Any, path: Path) -> None:
+    if not path.is_file():
+        raise ModelError(path, "no such LoRA file")
+    try:
+        pipeline.load_lora_weights(
+            str(path.parent), weight_name=path.name, adapter_name="exposure", local_files_only=True
+        )
+        pipeline.set_adapters("exposure", PAPER_DEFAULTS.lora_scale)
+    except Exception as error:
+        raise ModelError(path, f"is not a LoRA for this model ({type(error).__name__}: {error})") from error

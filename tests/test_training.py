@@ -1,0 +1,226 @@
+"""Training: the closed-form autoencoder, reproducible pictures, a loop that resumes where it stood."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from diffusers import AutoencoderTiny
+from torch import Tensor, nn
+
+from dl_core.backends.diffusers_painter import DiffusersPainter
+from dl_core.backends.mini import MiniModel
+from dl_core.errors import OptionError
+from dl_core.exposure import decode_display
+from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
+from dl_core.training.decoder import train_decoder
+from dl_core.training.denoiser import draw_batch
+from dl_core.training.export import write_networks
+from dl_core.training.loop import Budget, train
+from dl_core.training.lora import train_lora
+from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
+from dl_core.training.procedural import draw_panorama
+from dl_core.training.scenes import SceneSampler
+
+
+@pytest.fixture(scope="module")
+def panoramas() -> Tensor:
+    return torch.cat([draw_panorama(seed, 32) for seed in range(4)])
+
+
+@pytest.fixture(scope="module")
+def vae() -> AutoencoderTiny:
+    torch.manual_seed(0)
+    vae = AutoencoderTiny(scaling_factor=1.0).eval()
+    write_closed_form_encoder(vae)
+    write_thumbnail_decoder(vae)
+    return vae
+
+
+def _pictures() -> Tensor:
+    """Noise, flat colours, and a small light in the dark."""
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.rand(1, 64, 64, 3, generator=generator)
+    flat = torch.rand(1, 1, 1, 3, generator=generator).expand(1, 64, 64, 3)
+    spot = torch.zeros(1, 64, 64, 3)
+    spot[:, 20:22, 40:43] = 1
+    return torch.cat((noise, noise**4, flat, spot))
+
+
+def test_the_encoder_computes_the_latents_of_the_definition(vae: AutoencoderTiny) -> None:
+    pictures = _pictures()
+    with torch.no_grad():
+        encoded = vae.encode(pictures.permute(0, 3, 1, 2) * 2 - 1).latents
+    # Ten layers of fp32 sums of values up to 40: a few hundred units in the last place.
+    torch.testing.assert_close(encoded, block_latents(pictures), atol=5e-5, rtol=0)
+
+
+def test_a_block_rendered_smaller_has_the_same_latent() -> None:
+    pictures = _pictures()
+    enlarged = pictures.repeat_interleave(2, dim=1).repeat_interleave(2, dim=2)
+    torch.testing.assert_close(block_latents(enlarged, 8), block_latents(pictures, 4))
+
+
+def test_unevenness_is_nothing_on_flat_blocks_and_grows_with_a_light() -> None:
+    latents = block_latents(_pictures())
+    assert latents[2, 3].std() < 1e-4
+    assert latents[3, 3].argmax() == (20 // 8) * 8 + 40 // 8
+
+
+def test_the_untrained_decoder_paints_blocks_in_their_mean_colour(vae: AutoencoderTiny) -> None:
+    flat = torch.rand(1, 1, 1, 3, generator=torch.Generator().manual_seed(5)) * 0.4 + 0.3
+    latents = block_latents(flat.expand(1, 64, 64, 3).contiguous())
+    with torch.no_grad():
+        painted = vae.decode(latents).sample / 2 + 0.5
+    inner = painted[:, :, 16:-16, 16:-16]
+    # tanh(z / 3) * 3 inside the decoder bends latents of order 1 by a few percent; the rest is random weights x 0.05.
+    assert (inner.mean(dim=(2, 3)) - flat[:, 0, 0]).abs().max() < 0.06
+
+
+def test_pictures_follow_from_seed_and_index(panoramas: Tensor) -> None:
+    first, again = (SceneSampler(panoramas, 64, 32, seed=7).draw(11) for _ in range(2))
+    other = SceneSampler(panoramas, 64, 32, seed=8).draw(11)
+    assert torch.equal(first.canvas_ldr, again.canvas_ldr)
+    assert first.ball == again.ball
+    assert not torch.equal(first.canvas_ldr, other.canvas_ldr)
+
+
+def test_pictures_are_display_encoded_and_the_bracket_spans_its_evs(panoramas: Tensor) -> None:
+    sampler = SceneSampler(panoramas, 64, 32, seed=1, bracket=True)
+    pictures = [sampler.draw(index) for index in range(40)]
+    values = torch.cat([picture.canvas_ldr for picture in pictures])
+    assert values.min() >= 0
+    assert values.max() <= 1
+    evs = sorted(picture.ev for picture in pictures)
+    assert -5 <= evs[0] < -3.5
+    assert -1.5 < evs[-1] <= 0
+
+
+def test_a_darker_picture_shows_the_same_light_less_bright(panoramas: Tensor) -> None:
+    """Where neither clips, decoded values at two EVs differ by the factor 2^ΔEV."""
+    sampler = SceneSampler(panoramas, 64, 32, seed=2, bracket=True)
+    picture = sampler.draw(3)
+    sampler._bracket_kind = lambda generator: (  # type: ignore[method-assign]
+        "mirror",
+        SceneSampler._bracket_kind(sampler, generator)[1] - 1,
+        0,
+    )
+    darker = sampler.draw(3)
+    bright, dark = decode_display(picture.canvas_ldr), decode_display(darker.canvas_ldr)
+    ball = slice(24, 40)
+    unclipped = (picture.canvas_ldr < 1)[:, ball, ball]
+    torch.testing.assert_close(
+        dark[:, ball, ball][unclipped], bright[:, ball, ball][unclipped] / 2, atol=1e-5, rtol=1e-3
+    )
+
+
+def test_a_batch_mixes_signal_and_noise_as_its_timesteps_say(panoramas: Tensor) -> None:
+    batch = draw_batch(SceneSampler(panoramas, 64, 32, seed=1), 5, 6, full_canvas=128)
+    again = draw_batch(SceneSampler(panoramas, 64, 32, seed=1), 5, 6, full_canvas=128)
+    assert torch.equal(batch.noisy, again.noisy)
+    assert batch.noisy.shape == (6, 4, 16, 16)
+    assert batch.balls[0].canvas == 128
+    assert batch.weights.min() == pytest.approx(0.3)
+    assert batch.weights.max() == pytest.approx(1.0)
+
+
+class _Line(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.slope = nn.Parameter(torch.zeros(2))
+
+
+def _fit(folder: Path, steps: int, until: int | None = None) -> Tensor:
+    line = _Line()
+
+    def loss(step: int) -> Tensor:
+        if step == until:
+            raise KeyboardInterrupt
+        x = torch.randn(8, 2, generator=torch.Generator().manual_seed(step))
+        return (x @ (line.slope - torch.tensor([1.0, -2.0]))).square().mean()
+
+    return train({"line": line}, loss, Budget(steps, 0.1, warmup=3), folder, report=lambda text: None)["line"]["slope"]
+
+
+def test_a_killed_training_resumes_bit_for_bit(tmp_path: Path) -> None:
+    from dl_core.errors import Interrupted
+
+    whole = _fit(tmp_path / "whole", 40)
+    with pytest.raises(Interrupted, match="step 17"):
+        _fit(tmp_path / "parts", 40, until=17)
+    assert torch.equal(_fit(tmp_path / "parts", 40), whole)
+    assert torch.allclose(whole, torch.tensor([1.0, -2.0]), atol=0.2)
+    steps = [json.loads(line)["step"] for line in (tmp_path / "parts" / "log.jsonl").read_text().splitlines()]
+    assert steps[-1] == 40
+
+
+@pytest.mark.parametrize(("steps", "rate", "named"), [(0, 1e-3, "steps"), (10, 0.0, "learning rate")])
+def test_budgets_that_make_no_sense_are_refused(steps: int, rate: float, named: str) -> None:
+    with pytest.raises(OptionError, match=named):
+        Budget(steps, rate)
+
+
+def test_decoder_training_lowers_its_loss_and_leaves_the_encoder(panoramas: Tensor, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = MiniModel.untrained()
+    sampler = SceneSampler(panoramas, 128, 64, seed=1, bracket=True)
+    weights = train_decoder(model, sampler, Budget(2, 1e-3, warmup=1), tmp_path, batch=1, report=lambda text: None)[
+        "vae"
+    ]
+    fresh = AutoencoderTiny(scaling_factor=1.0)
+    write_closed_form_encoder(fresh)
+    for name, tensor in fresh.encoder.state_dict().items():
+        assert torch.equal(weights[f"encoder.{name}"], tensor), name
+    assert write_networks(tmp_path, {"vae": weights})[0].stat().st_size < 6e6
+
+
+def test_the_lora_touches_attention_only_and_loads_into_the_painter(panoramas: Tensor, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = MiniModel.untrained()
+    sampler = SceneSampler(panoramas, 128, 64, seed=1, bracket=True)
+    lora = train_lora(model, sampler, Budget(2, 1e-3, warmup=1), tmp_path, batch=1, rank=4, report=lambda text: None)
+    assert lora
+    assert all(".attn" in name and ".lora_" in name for name in lora)
+    assert all(4 in tensor.shape for tensor in lora.values())
+    moved = [name for name, tensor in lora.items() if ".lora_B" in name and tensor.abs().max() > 0]
+    assert moved
+    fresh = MiniModel.untrained()
+    fields = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__}
+    painter = DiffusersPainter.from_mini(MiniModel(**{**fields, "lora": lora}))
+    assert painter.pipeline.get_active_adapters() == ["exposure"]
+
+
+def test_scenes_are_drawn_once_and_read_back(tmp_path: Path) -> None:
+    spoken: list[str] = []
+    draw_scenes(tmp_path, 2, 16, report=spoken.append)
+    draw_scenes(tmp_path, 3, 16, report=spoken.append)
+    assert len(spoken) == 3
+    bank = load_panoramas(None, tmp_path, height=16)
+    # Half floats keep 11 bits.
+    torch.testing.assert_close(bank[2:3], draw_panorama(2, 16), rtol=2**-10, atol=1e-6)
+
+
+def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="lightprobe train data"):
+        load_panoramas(None, tmp_path, height=16)
+    with pytest.raises(OptionError, match=r"manifest\.json"):
+        panorama_files(tmp_path, "training")
+    (tmp_path / "manifest.json").write_text('[{"file": "a.exr", "split": "validation"}]')
+    with pytest.raises(OptionError, match="validation"):
+        panorama_files(tmp_path, "training")
+
+
+def test_reducing_keeps_the_mean() -> None:
+    latlong = torch.rand(1, 32, 64, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(reduce_panorama(latlong, 8).mean(), latlong.mean())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_procedural_panoramas_are_radiance_with_light_above(seed: int) -> None:
+    panorama = draw_panorama(seed, 32)
+    assert panorama.shape == (1, 32, 64, 3)
+    assert torch.isfinite(panorama).all()
+    assert panorama.min() >= 0
+    assert panorama[:, :16].sum() > panorama[:, 16:].sum()
