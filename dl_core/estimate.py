@@ -132,7 +132,7 @@ def estimate(
     )
     ball_hdr = merge_bracket([exposure.ball for exposure in exposures], evs, settings.merge)
     return Probe(
-        latlong_hdr=ball_to_latlong(ball_hdr, settings.height),
+        latlong_hdr=ball_to_latlong(ball_hdr, settings.height, painted=True),
         ball_hdr=ball_hdr,
         exposures=exposures,
         composite_ldr=paste_ball(canvas, exposures[0].ball, ball),

@@ -357,6 +357,7 @@ def ball_to_latlong(
     radius: float | None = None,
     centre: tuple[float, float] | None = None,
     samples: int = 4,
+    painted: bool = False,
 ) -> Latlong:
     """Unwrap an orthographic mirror ball to a latlong map.
 
@@ -367,6 +368,9 @@ def ball_to_latlong(
             stands 20 degrees from straight ahead by 2.8 degrees (for D = 256).
         centre: (x, y) of the ball in the crop, in pixels from its top-left corner; the middle when not given.
         samples: samples along each side of a pixel of the map.
+        painted: leave out the rim's pixels whose centre is off the ball. A picture shows background there, which no
+            exposure darkens, so that a merge would take it for a lamp. Of a rendered ball (`latlong_to_ball`) those
+            pixels hold only the ball; leaving them out costs up to 0.6% of the energy of a scene bright ahead.
 
     Returns:
         (B, height, 2 height, C).
@@ -381,7 +385,13 @@ def ball_to_latlong(
     size = ball.shape[1]
     radius = size / 2 if radius is None else radius
     centre = (size / 2, size / 2) if centre is None else centre
-    weights = _rim_weights(size, float(radius), (float(centre[0]), float(centre[1]))).to(ball)[None, :, :, None]
+    weights = _rim_weights(size, float(radius), (float(centre[0]), float(centre[1]))).to(ball)
+    if painted:
+        positions = _subpixels(size, 1, ball.device)
+        weights = weights * (_crop_disc(positions, positions, radius, centre).square().sum(-1) <= 1)
+    weights = weights[None, :, :, None]
+    # Multiplied by 0, what is left out could still be NaN.
+    ball = torch.where(weights > 0, ball, torch.zeros_like(ball))
     weighted = torch.cat((ball * weights, weights.expand(ball.shape[0], -1, -1, -1)), dim=-1)
 
     def reflect(directions: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from analytic_painter import AnalyticPainter, Flaws
 
+from dl_core.ball import crop_ball, disc_mask
 from dl_core.bench.skies import SunAndSky, sun_direction
 from dl_core.errors import ImageError, Interrupted, OptionError
 from dl_core.estimate import Settings, check_photograph, estimate, planned_evaluations
@@ -16,6 +17,7 @@ from dl_core.exposure import auto_exposure, expose
 from dl_core.geometry import latlong_directions, latlong_solid_angles, latlong_to_perspective
 from dl_core.iterative import Rounds
 from dl_core.metrics import angular_error, energy_kept, irradiance, si_rmse, spread_directions
+from dl_core.painter import Observer, PaintRequest, PaintResult
 
 SETTINGS = Settings(rounds=Rounds(balls=3, rounds=1, strength=0.8, steps=5), canvas=128, diameter=64, height=32)
 PHOTO = torch.full((1, 24, 32, 3), 0.5)
@@ -71,6 +73,19 @@ def test_exposures_that_disagree_cost_the_paper_merge_no_colour() -> None:
     shown = probe.exposures[0].ball ** 2.4
     cross = torch.linalg.cross(probe.ball_hdr, shown).norm(dim=-1)
     assert float(cross.max()) <= 1e-4 * float(probe.ball_hdr.norm(dim=-1).max())
+
+
+def test_a_bright_background_is_no_lamp() -> None:
+    # The photograph shines through beside the rim at every EV: merged, it would be 32 times as bright as white.
+    class OnWhite(AnalyticPainter):
+        def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+            result = super().paint(request, observer)
+            disc = crop_ball(disc_mask(request.ball)[..., None], request.ball)
+            return replace(result, balls=torch.where(disc == 1, result.balls, torch.ones(())))
+
+    truth = light()
+    plain, on_white = (estimate(PHOTO, kind(truth), SETTINGS).latlong_hdr for kind in (AnalyticPainter, OnWhite))
+    assert torch.equal(plain, on_white)
 
 
 def test_the_probe_tells_what_it_cost() -> None:

@@ -377,6 +377,21 @@ def test_an_off_centre_ball_is_found_where_it_is() -> None:
     torch.testing.assert_close(found, centred, rtol=1e-3, atol=1e-2)  # positions in a wider crop round differently
 
 
+def test_the_background_of_a_painted_ball_does_not_light_the_map() -> None:
+    ball = latlong_to_ball(lobes(64), 128)
+    offset = torch.arange(128) - 63.5
+    off_ball = torch.hypot(offset[None, :], offset[:, None])[None, ..., None] > 64
+    dark, bright = (
+        ball_to_latlong(torch.where(off_ball, torch.tensor(shown), ball), 64, painted=True) for shown in (0.0, 1e6)
+    )
+    assert torch.equal(dark, bright)
+    # What the slivers of the rim would have told is told by their neighbours, half a pixel further in. The third
+    # channel's lobe is narrower than that: 15 degrees straight ahead, where the last pixel spans 20.
+    resolved = lobes(64)[..., :2]
+    error = (dark[..., :2] - resolved).square().mean().sqrt() / resolved.square().mean().sqrt()
+    assert float(error) < 0.02
+
+
 def test_a_ball_smaller_than_its_crop_leaves_the_rest_dark() -> None:
     ball = latlong_to_ball(torch.ones(1, 16, 32, 3), 64, radius=20.0)
     assert float(ball[0, 0].max()) == 0

@@ -51,6 +51,11 @@ def _channel(ball: BallImage, evs: tuple[float, ...]) -> BallImage:
     return merge_channel(perfect_bracket(ball, evs), evs)
 
 
+def _unwrap(ball_hdr: BallImage, height: int) -> Latlong:
+    """As `estimate` unwraps: what a painter leaves beside the ball is not looked at."""
+    return ball_to_latlong(ball_hdr, height, painted=True)
+
+
 ROWS: Final[dict[str, Row]] = {
     "reference": Row(
         "reference: unwrap 8-bit maps, luminance merge",
@@ -67,21 +72,21 @@ ROWS: Final[dict[str, Row]] = {
     "hdr-reference": Row("true HDR ball, reference unwrap", reference_unwrap),
     "paper": Row(
         "paper merge on the ball, our unwrap",
-        lambda ball, height: ball_to_latlong(merge_paper(perfect_bracket(ball, PAPER_EVS), PAPER_EVS), height),
+        lambda ball, height: _unwrap(merge_paper(perfect_bracket(ball, PAPER_EVS), PAPER_EVS), height),
     ),
     "channel": Row(
         "channel merge on the ball, our unwrap",
-        lambda ball, height: ball_to_latlong(_channel(ball, PAPER_EVS), height),
+        lambda ball, height: _unwrap(_channel(ball, PAPER_EVS), height),
     ),
     "channel-long": Row(
         "the same, bracket to EV -10",
-        lambda ball, height: ball_to_latlong(_channel(ball, LONG_EVS), height),
+        lambda ball, height: _unwrap(_channel(ball, LONG_EVS), height),
     ),
     "ceiling": Row(
         "true HDR ball clipped at the short bracket's ceiling",
-        lambda ball, height: ball_to_latlong(ball.clamp(max=2.0 ** -PAPER_EVS[-1]), height),
+        lambda ball, height: _unwrap(ball.clamp(max=2.0 ** -PAPER_EVS[-1]), height),
     ),
-    "hdr": Row("true HDR ball, our unwrap", lambda ball, height: ball_to_latlong(ball, height)),
+    "hdr": Row("true HDR ball, our unwrap of a rendered ball", lambda ball, height: ball_to_latlong(ball, height)),
 }
 """What is compared, in the order of the table."""
 
