@@ -82,6 +82,8 @@ def atomic(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.replace(path)
+    except OutputError:
+        raise
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
@@ -91,16 +93,17 @@ def atomic(path: str | Path) -> Iterator[Path]:
 
 def _require_place(path: Path) -> None:
     try:
-        if not path.parent.is_dir():
-            raise OutputError(path, f"the folder {path.parent} does not exist or is no folder")
-        if path.is_dir():
-            raise OutputError(path, "is a folder; give the name of a file")
+        folder_is_there, is_folder = path.parent.is_dir(), path.is_dir()
     except OSError as error:
         raise _unwritable(path, error) from error
+    if not folder_is_there:
+        raise OutputError(path, f"the folder {path.parent} does not exist or is no folder")
+    if is_folder:
+        raise OutputError(path, "is a folder; give the name of a file")
 
 
 def _unwritable(path: Path, error: OSError) -> OutputError:
-    return error if isinstance(error, OutputError) else OutputError(path, f"cannot be written ({_reason(error)})")
+    return OutputError(path, f"cannot be written ({_reason(error)})")
 
 
 def require_writable(path: str | Path) -> None:
