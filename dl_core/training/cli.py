@@ -50,10 +50,13 @@ class Stage:
     train: Callable[[argparse.Namespace, Report], list[Path]]
 
 
+PANORAMA_ROWS: Final = 128
+
+
 def _sampler(
-    args: argparse.Namespace, model: MiniModel, *, scale: int, height: int, **options: bool | float
+    args: argparse.Namespace, model: MiniModel, *, scale: int = SKETCH, bracket: bool = False, centred: float = 0.7
 ) -> SceneSampler:
-    bank = load_panoramas(args.panoramas, args.work / "scenes", height=height)
+    bank = load_panoramas(args.panoramas, args.work / "scenes", height=PANORAMA_ROWS)
     canvas, diameter = model.defaults.canvas // scale, model.defaults.diameter // scale
     ev_min = model.defaults.ev_min
     return SceneSampler(bank, canvas, diameter, args.seed, bracket=bracket, centred=centred, ev_min=ev_min)

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from diffusers.utils import convert_state_dict_to_diffusers
 from peft import LoraConfig
 from peft.utils import get_peft_model_state_dict
 from torch import Tensor
@@ -73,7 +72,7 @@ def train_lora(
 
     averaged = train({"unet": model.unet.train()}, loss_of_step, budget, folder, report=report)
     adapter = get_peft_model_state_dict(model.unet, averaged["unet"], adapter_name="exposure")
-    return {f"unet.{key}": value for key, value in convert_state_dict_to_diffusers(adapter).items()}
+    return {f"unet.{key}": value for key, value in adapter.items()}
 
 
 def _ball_only(batch: Batch) -> Batch:

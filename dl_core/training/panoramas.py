@@ -8,6 +8,8 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
 
 from ..errors import ImageError, OptionError
 from ..imageio import read_envmap, write_exr
@@ -34,7 +36,7 @@ def panorama_files(folder: Path, split: str) -> list[Path]:
     return files
 
 
-def reduce_panorama(latlong: Latlong, height: int) -> Latlong:
+def reduce_panorama(latlong: Latlong, height: int) -> Float[Tensor, "b rows cols c"]:
     """Average a map down to `height` rows, a divisor of its own.
 
     Raises:
