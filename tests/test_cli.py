@@ -232,6 +232,16 @@ def test_the_output_is_checked_before_anything_is_loaded(
     assert "a.spheres.png: is a folder" in capsys.readouterr().err
 
 
+def test_the_input_is_not_overwritten(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend()
+    before = photo.rename(photo.with_name("a.ball.png")).read_bytes()
+    assert run(photo.with_name("a.ball.png"), photo.parent) == 2
+    assert "does not overwrite the input" in capsys.readouterr().err
+    assert photo.with_name("a.ball.png").read_bytes() == before
+
+
 @pytest.mark.parametrize("after", [1, EVALUATIONS // 2, EVALUATIONS])
 @pytest.mark.parametrize("event", [KeyboardInterrupt(), Interrupted("stopped")])
 def test_interruption_leaves_nothing_half_written(

@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -113,8 +113,11 @@ class _Outputs:
             raise OptionError("output", name, "a name that ends in " + " or ".join(_WRITERS))
         return _Outputs(path, path.with_suffix(".ball.png"), path.with_suffix(".spheres.png"))
 
-    def require_writable(self) -> None:
+    def require_writable(self, sources: Iterable[Path]) -> None:
+        """Make sure all can be written, and that none is a file the run reads."""
         for path in (self.map, self.ball, self.spheres):
+            if path.resolve() in {source.resolve() for source in sources}:
+                raise OptionError("output", str(self.map), f"a name that does not overwrite the input {path}")
             require_writable(path)
 
 
@@ -145,7 +148,7 @@ def run(args: argparse.Namespace) -> None:
         raise OptionError("seed", args.seed, "0 to 4294967295")
     if not 2 <= args.height <= 4096:
         raise OptionError("height", args.height, "2 to 4096 rows")
-    outputs.require_writable()
+    outputs.require_writable([Path(name) for name in (args.photo, args.depth) if name is not None])
     photo = read_photograph(args.photo)
     depth = None if args.depth is None else read_photograph(args.depth)
     loaded = backend.load(args)
