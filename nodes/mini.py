@@ -14,6 +14,7 @@ from typing import Any, Final
 import comfy.cldm.cldm
 import comfy.controlnet
 import comfy.latent_formats
+import comfy.model_base
 import comfy.model_management
 import comfy.model_patcher
 import comfy.ops
@@ -24,7 +25,7 @@ import comfy.supported_models_base
 import comfy.utils
 import torch
 
-from ..dl_core.backends.mini import CONTROLNET_CONFIG, TEXT_CONFIG, UNET_CONFIG, MiniModel
+from ..dl_core.backends.mini import CONTROLNET_CONFIG, SCHEDULER_CONFIG, TEXT_CONFIG, UNET_CONFIG, MiniModel
 from ..dl_core.errors import ModelError
 from .lora import with_lora
 
@@ -58,6 +59,12 @@ _UP_DEPTHS: Final = [depth for depth in _COMFY_BLOCKS["transformer_depth"] for _
 """An up level has one block more than a down level, and ComfyUI lists them from the outermost inwards."""
 
 
+_PREDICTIONS: Final = {
+    "epsilon": comfy.model_base.ModelType.EPS,
+    "v_prediction": comfy.model_base.ModelType.V_PREDICTION,
+}
+
+
 class _MiniLatents(comfy.latent_formats.LatentFormat):  # type: ignore[misc]
     """Four channels, used as the autoencoder gives them."""
 
@@ -68,7 +75,17 @@ class _MiniSDXL(comfy.supported_models.SDXL):  # type: ignore[misc]
     """SDXL as ComfyUI knows it, at the mini model's widths."""
 
     latent_format = _MiniLatents
+    sampling_settings = {  # noqa: RUF012  the base class copies it
+        "beta_schedule": "linear",
+        "linear_start": SCHEDULER_CONFIG["beta_start"],
+        "linear_end": SCHEDULER_CONFIG["beta_end"],
+        "timesteps": SCHEDULER_CONFIG["num_train_timesteps"],
+    }
     unet_config = _COMFY_BLOCKS | {"out_channels": UNET_CONFIG["out_channels"], "transformer_depth_output": _UP_DEPTHS}
+
+    def model_type(self, state_dict: Weights, prefix: str = "") -> Any:
+        """What the network predicts, as its schedule says."""
+        return _PREDICTIONS[SCHEDULER_CONFIG["prediction_type"]]
 
 
 def _rename(weights: Weights, names: dict[str, str], source: str) -> Weights:

@@ -2,8 +2,8 @@
 
 ComfyUI imports torchvision at module level in model families these tests do not use, so empty modules will do. Others
 ask `importlib.util.find_spec` whether it is there and would then want its contents: they are told that it is not.
-spandrel, which cannot do without it, gets a stand-in too: ComfyUI's UpscaleModelLoader needs its names, and without that
-node the web client fails on every model loader.
+spandrel, which cannot do without it, gets a stand-in too: ComfyUI's UpscaleModelLoader needs its names, and the web
+client fails on every model loader where that node is missing.
 """
 
 import importlib.util

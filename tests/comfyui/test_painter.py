@@ -1,0 +1,243 @@
+"""ComfyPainter: the port's promises, and agreement with the diffusers path on the same weights, noise and steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from comfy_host import pack_module
+
+STEPS = 3
+
+
+@pytest.fixture(autouse=True)
+def _no_gradients() -> Any:
+    with torch.no_grad():
+        yield
+
+
+class Recorder:
+    """An observer that adds up."""
+
+    def __init__(self) -> None:
+        self.evaluations = 0
+
+    def evaluated(self, count: int) -> None:
+        self.evaluations += count
+
+    def painted(self, ev: float, round_index: int, balls: Any) -> None:
+        raise AssertionError("a painter knows no rounds")
+
+
+def painter(graph: Any, **options: Any) -> Any:
+    module = pack_module("nodes.painter")
+    extra = {name: options.pop(name) for name in ("mask", "on_balls") if name in options}
+    return module.ComfyPainter(module.Networks(**graph.sockets()), module.Guidance(**options), **extra)
+
+
+def request(scene: Any, seeds: tuple[int, ...] = (0,), strength: float = 1.0, steps: int = STEPS) -> Any:
+    kind = pack_module("dl_core.painter").PaintRequest
+    return kind(scene.canvas, scene.depth, scene.ball, 0.0, seeds, strength=strength, steps=steps)
+
+
+def paint(graph: Any, asked: Any, **options: Any) -> Any:
+    return painter(graph, **options).paint(asked, Recorder())
+
+
+def samplers() -> tuple[str, ...]:
+    return ("uni_pc", "uni_pc_bh2", "euler", "dpmpp_2m", "deis", "ipndm", "ipndm_v", "lms", "res_multistep")
+
+
+def test_list_of_samplers_is_the_one_tested(pack: Any) -> None:
+    assert samplers() == pack_module("nodes.painter").SAMPLERS
+
+
+@pytest.mark.parametrize("sampler", samplers())
+@pytest.mark.parametrize(("cfg", "strength"), [(5.0, 1.0), (1.0, 0.7)])
+def test_evaluations_are_counted_and_foretold(
+    graph: Any, scene: Any, sampler: str, cfg: float, strength: float
+) -> None:
+    """Counted where the network itself is called, a batch of n being n evaluations."""
+    calls: list[int] = []
+    hook = graph.model.model.diffusion_model.register_forward_hook(
+        lambda module, arguments, output: calls.append(len(output))
+    )
+    observer = Recorder()
+    brush = painter(graph, cfg=cfg, sampler=sampler, batch_size=2)
+    try:
+        result = brush.paint(request(scene, (3, 4, 5), strength), observer)
+    finally:
+        hook.remove()
+    foretold = brush.evaluations(3, STEPS, strength)
+    assert sum(calls) == result.evaluations == observer.evaluations == foretold
+    assert foretold == 3 * {1.0: 3, 0.7: 2}[strength] * (1 if cfg == 1 else 2)
+    assert result.balls.shape == (3, 32, 32, 3)
+    assert result.balls.min() >= 0
+    assert result.balls.max() <= 1
+
+
+@pytest.mark.parametrize("sampler", samplers())
+def test_a_ball_depends_on_its_seed_and_not_on_its_batch(graph: Any, scene: Any, sampler: str) -> None:
+    together = paint(graph, request(scene, (7, 8, 9)), sampler=sampler, batch_size=3).balls
+    alone = paint(graph, request(scene, (8,)), sampler=sampler).balls
+    assert (together[1] - alone[0]).abs().max() < 1e-5  # order of summation in batched matrix products
+    assert (together[0] - together[1]).abs().max() > 1e-4
+
+
+def test_strength_one_starts_from_noise_alone(graph: Any, scene: Any) -> None:
+    """Under the disc the photograph must not show through: two photographs that differ there only give one ball."""
+    other = scene.canvas.clone()
+    inside = pack_module("dl_core.ball").disc_mask(scene.ball)[..., None]
+    other = other * (1 - inside) + (1 - other) * inside
+    latent, changed = (graph.vae.encode(picture) for picture in (scene.canvas, other))
+    assert (latent - changed).abs().max() > 1e-3
+    seen: list[torch.Tensor] = []
+    hook = graph.model.model.diffusion_model.register_forward_pre_hook(
+        lambda module, arguments: seen.append(arguments[0].clone())
+    )
+    try:
+        for canvas in (scene.canvas, other):
+            paint(graph, request(replace(scene, canvas=canvas)), sampler="euler")
+    finally:
+        hook.remove()
+    centre = (slice(None), slice(None), slice(3, 5), slice(3, 5))
+    assert torch.equal(seen[0][centre], seen[STEPS][centre])
+
+
+@pytest.mark.parametrize("steps", [30, 20, 6])
+def test_paper_schedule_visits_what_diffusers_visits(graph: Any, scene: Any, steps: int) -> None:
+    from diffusers import UniPCMultistepScheduler
+
+    reference = UniPCMultistepScheduler(
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", timestep_spacing="leading", steps_offset=1
+    )
+    reference.set_timesteps(steps)
+    visited = pack_module("nodes.painter").leading_timesteps(steps)
+    assert visited == reference.timesteps.tolist()
+    if steps == 30:
+        assert visited[:2] + visited[-1:] == [961, 929, 33]
+    times: list[float] = []
+    hook = graph.model.model.diffusion_model.register_forward_pre_hook(
+        lambda module, arguments: times.append(float(arguments[1][0]))
+    )
+    try:
+        paint(graph, request(scene, steps=steps), cfg=1.0)
+    finally:
+        hook.remove()
+    assert times == visited
+
+
+@pytest.mark.parametrize("scheduler", ["simple", "karras", "beta", "sgm_uniform", "normal", "exponential"])
+def test_comfyui_schedules_run_the_steps_asked_for(graph: Any, scene: Any, scheduler: str) -> None:
+    brush = painter(graph, scheduler=scheduler, sampler="euler")
+    result = brush.paint(request(scene, steps=5, strength=0.8), Recorder())
+    assert result.evaluations == brush.evaluations(1, 5, 0.8) == 8
+
+
+def test_hears_of_balls_after_every_batch(graph: Any, scene: Any) -> None:
+    heard: list[int] = []
+    paint(graph, request(scene, (0, 1, 2)), batch_size=2, on_balls=lambda balls: heard.append(len(balls)))
+    assert heard == [2, 3]
+
+
+def test_interruption_stops_before_the_next_evaluation(graph: Any, scene: Any) -> None:
+    import comfy.model_management
+
+    class Interrupter(Recorder):
+        def evaluated(self, count: int) -> None:
+            super().evaluated(count)
+            if self.evaluations >= 4:
+                comfy.model_management.interrupt_current_processing()
+
+    observer = Interrupter()
+    with pytest.raises(comfy.model_management.InterruptProcessingException):
+        painter(graph).paint(request(scene, steps=8), observer)
+    assert observer.evaluations == 4
+    assert paint(graph, request(scene)).evaluations == 2 * STEPS  # and the next run is not disturbed
+
+
+@pytest.mark.parametrize("step", range(1, 9))
+def test_interruption_at_any_step(graph: Any, scene: Any, step: int) -> None:
+    errors = pack_module("dl_core.errors")
+
+    class Stopper(Recorder):
+        def evaluated(self, count: int) -> None:
+            super().evaluated(count)
+            if self.evaluations == 2 * step:
+                raise errors.Interrupted("test")
+
+    observer = Stopper()
+    with pytest.raises(errors.Interrupted):
+        painter(graph).paint(request(scene, steps=8), observer)
+    assert observer.evaluations == 2 * step
+
+
+def test_one_step_is_refused_where_the_sampler_cannot(graph: Any, scene: Any) -> None:
+    errors = pack_module("dl_core.errors")
+    with pytest.raises(errors.OptionError, match=r"steps is 2.*uni_pc"):
+        paint(graph, request(scene, steps=2, strength=0.5))
+    assert paint(graph, request(scene, steps=1), sampler="euler").evaluations == 2
+
+
+def test_decoding_the_neighbourhood_is_decoding_the_ball(graph: Any, generator: torch.Generator) -> None:
+    """The margin covers most of the decoder's field of view: the difference stays under half an 8-bit code."""
+    module, balls = pack_module("nodes.painter"), pack_module("dl_core.ball")
+    ball = balls.place_ball(512, 64, x=200, y=260)
+    latents = torch.randn(1, 4, 64, 64, generator=generator)
+    whole = balls.crop_ball(graph.vae.decode(latents), ball)
+    assert (module._decode_ball(graph.vae, latents, ball) - whole).abs().max() < 0.5 / 255
+
+
+# --- agreement with diffusers ------------------------------------------------------------------------------------
+
+
+def diffusers_painter(mini: Any, sampler: str, guidance: float, control: float) -> Any:
+    backend = pack_module("dl_core.backends.diffusers_painter")
+    defaults = replace(mini.defaults, guidance=guidance, control_scale=control)
+    return backend.DiffusersPainter.from_mini(replace(mini, defaults=defaults, lora=None), sampler=sampler)
+
+
+@pytest.fixture
+def leading_euler(monkeypatch: pytest.MonkeyPatch) -> str:
+    """diffusers' Euler on the paper's timesteps, as one more row of the backend's table."""
+    from diffusers import EulerDiscreteScheduler
+
+    class LeadingEuler(EulerDiscreteScheduler):
+        def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
+            super().set_timesteps(timesteps=pack_module("nodes.painter").leading_timesteps(num_inference_steps))
+
+    table = pack_module("dl_core.backends.diffusers_painter").SAMPLERS
+    monkeypatch.setitem(table, "leading_euler", lambda config: LeadingEuler.from_config(config))
+    return "leading_euler"
+
+
+def euler_difference(graph: Any, scene: Any, steps: int, strength: float, row: str) -> tuple[float, float]:
+    """Mean absolute difference of two balls from diffusers' Euler, and the standard deviation of the latter."""
+    asked = request(scene, (0, 1), strength, steps)
+    theirs = diffusers_painter(graph.mini, row, 3.0, 0.5).paint(asked, Recorder()).balls
+    ours = paint(graph, asked, sampler="euler", cfg=3.0, control_strength=0.5).balls
+    return float((ours - theirs).abs().mean()), float(theirs.std())
+
+
+SCHEDULES = pytest.mark.parametrize(("steps", "strength"), [(6, 1.0), (10, 0.8)])
+
+
+@SCHEDULES
+def test_euler_agrees_with_diffusers(
+    graph: Any, mini_scene: Any, leading_euler: str, steps: int, strength: float
+) -> None:
+    """Untrained networks paint balls of little contrast, so the difference is held against that contrast."""
+    difference, contrast = euler_difference(graph, mini_scene, steps, strength, leading_euler)
+    assert difference <= 0.02 * contrast
+
+
+@SCHEDULES
+def test_euler_agrees_with_diffusers_on_trained_weights(
+    trained_graph: Any, mini_scene: Any, leading_euler: str, steps: int, strength: float
+) -> None:
+    """The project's bar: 1e-2 in [0, 1]."""
+    difference, contrast = euler_difference(trained_graph, mini_scene, steps, strength, leading_euler)
+    assert contrast > 0.05
+    assert difference <= 1e-2

@@ -1,0 +1,173 @@
+"""The real server: it serves the nodes, accepts the workflows, and runs the quickstart to an EXR that /view gives."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from comfy_host import REPOSITORY, Server, pack_module
+
+WORKFLOWS = ("mini_quickstart", "paper_sdxl")
+FILE_INPUTS = {
+    ("LoadImage", "image"),
+    ("CheckpointLoaderSimple", "ckpt_name"),
+    ("ControlNetLoader", "control_net_name"),
+    ("EVPromptInterp", "lora"),
+}
+"""Inputs that name a file of the user's: their values need not be on offer."""
+
+
+def workflow(name: str) -> dict[str, Any]:
+    return json.loads((REPOSITORY / "workflows" / f"{name}.api.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def info(server: Server) -> dict[str, Any]:
+    return server.get_json("/object_info")
+
+
+def faults(prompt: dict[str, Any], info: dict[str, Any]) -> list[str]:
+    """What keeps a prompt from running, files of the user aside."""
+    found = []
+    for number, node in prompt.items():
+        kind = info.get(node["class_type"])
+        if kind is None:
+            found.append(f"{number}: unknown class {node['class_type']}")
+            continue
+        required, optional = kind["input"]["required"], kind["input"].get("optional", {})
+        found += [f"{number}: {name} is missing" for name in required.keys() - node["inputs"].keys()]
+        found += [f"{number}: {name} is unknown" for name in node["inputs"].keys() - required.keys() - optional.keys()]
+        for name, value in node["inputs"].items():
+            spec = required.get(name) or optional.get(name)
+            fault = spec and _fault(prompt, info, node["class_type"], name, spec, value)
+            if fault:
+                found.append(f"{number}: {name} {fault}")
+    return found
+
+
+def _fault(prompt: dict[str, Any], info: dict[str, Any], kind: str, name: str, spec: list[Any], value: Any) -> str:
+    wanted, options = spec[0], spec[1] if len(spec) > 1 else {}
+    if isinstance(value, list):
+        source = prompt.get(value[0])
+        given = info[source["class_type"]]["output"][value[1]] if source else None
+        return "" if given == wanted else f"takes {wanted}, is linked to {given}"
+    choices = wanted if isinstance(wanted, list) else options.get("options")
+    if choices is not None:
+        return "" if value in choices or (kind, name) in FILE_INPUTS else f"is {value!r}, not one of {choices}"
+    types = {"INT": int, "FLOAT": (int, float), "STRING": str, "BOOLEAN": bool}
+    if wanted not in types or not isinstance(value, types[wanted]):
+        return f"is {value!r}, {wanted} is wanted"
+    if "min" in options and not options["min"] <= value <= options["max"]:
+        return f"is {value!r}, outside {options['min']} to {options['max']}"
+    return ""
+
+
+@pytest.mark.parametrize("name", WORKFLOWS)
+def test_workflow_is_valid(info: dict[str, Any], name: str) -> None:
+    assert faults(workflow(name), info) == []
+
+
+def test_validator_finds_faults(info: dict[str, Any]) -> None:
+    prompt = workflow("mini_quickstart")
+    by_class = {node["class_type"]: node["inputs"] for node in prompt.values()}
+    by_class["HDRMerge"]["method"] = "guess"
+    by_class["IterativeMedian"]["steps"] = 5000
+    by_class["IterativeMedian"]["vae"] = by_class["IterativeMedian"]["model"]
+    del by_class["SaveEnvMap"]["latlong"]
+    assert len(faults(prompt, info)) == 4
+
+
+def test_paper_workflow_has_the_papers_settings() -> None:
+    nodes = {node["class_type"]: node["inputs"] for node in workflow("paper_sdxl").values()}
+    paint = nodes["IterativeMedian"]
+    wanted = {"preset": "custom", "balls": 30, "rounds": 2, "strength": 0.8, "final": True, "steps": 30, "cfg": 5.0}
+    wanted |= {"sampler": "uni_pc", "scheduler": "leading (paper)", "control_strength": 0.5}
+    assert {name: paint[name] for name in wanted} == wanted
+    assert (nodes["DepthBallMask"]["canvas"], nodes["DepthBallMask"]["diameter"]) == (1024, 256)
+    assert nodes["EVPromptInterp"]["evs"] == "0, -2.5, -5"
+    assert nodes["EVPromptInterp"]["lora_scale"] == 0.75
+    assert nodes["HDRMerge"]["method"] == "paper"
+
+
+def test_server_accepts_the_paper_workflow_but_for_files_it_lacks(server: Server) -> None:
+    answer = server.post("/prompt", {"prompt": workflow("paper_sdxl")})
+    complaints = [error for node in answer["node_errors"].values() for error in node["errors"]]
+    assert complaints
+    named = {error["extra_info"].get("input_name") for error in complaints}
+    assert named <= {name for _, name in FILE_INPUTS}, complaints
+
+
+@pytest.fixture(scope="module")
+def quickstart(server: Server) -> dict[str, Any]:
+    entry = server.run(workflow("mini_quickstart"))
+    assert entry["status"]["status_str"] == "success", entry["status"]
+    return entry
+
+
+def test_quickstart_exr_is_in_the_history_and_served(
+    server: Server, quickstart: dict[str, Any], tmp_path: Path
+) -> None:
+    (saved,) = [output for output in quickstart["outputs"].values() if "envmaps" in output]
+    (file,) = saved["envmaps"]
+    assert file["type"] == "output"
+    path = tmp_path / "probe.exr"
+    path.write_bytes(server.get("/view", **file))
+    io = pack_module("dl_core.imageio")
+    assert io.read_envmap(path).shape == (1, 256, 512, 3)
+    header = io.read_exr_header(path)
+    assert json.loads(header["prompt"]) == workflow("mini_quickstart")
+    report = header["lightprobe"].splitlines()
+    assert [line.split(":")[0] for line in report[:3]] == ["EV 0", "EV -2.5", "EV -5"]
+    assert "36 denoiser evaluations" in report[0]
+    (preview,) = saved["images"]
+    assert server.get("/view", **preview).startswith(b"\x89PNG")
+
+
+def test_quickstart_paints_once_per_exposure(quickstart: dict[str, Any]) -> None:
+    counts = sorted(len(output["images"]) for output in quickstart["outputs"].values())
+    assert counts == [1, 1, 3]  # depth, map, composites
+
+
+def test_running_again_overwrites_nothing(server: Server, quickstart: dict[str, Any]) -> None:
+    prompt = workflow("mini_quickstart")
+    for node in prompt.values():
+        if node["class_type"] == "BallToEquirect":
+            node["inputs"]["height"] = 64
+    entry = server.run(prompt)
+    names = [file["filename"] for output in entry["outputs"].values() for file in output.get("envmaps", [])]
+    first = [file["filename"] for output in quickstart["outputs"].values() for file in output.get("envmaps", [])]
+    assert names
+    assert not set(names) & set(first)
+
+
+def test_error_names_node_and_reason(server: Server) -> None:
+    prompt = workflow("mini_quickstart")
+    for node in prompt.values():
+        if node["class_type"] == "SaveEnvMap":
+            node["inputs"]["filename_prefix"] = "../outside"
+        if node["class_type"] == "IterativeMedian":
+            node["inputs"] |= {"preset": "custom", "balls": 1, "steps": 2}
+    entry = server.run(prompt)
+    (error,) = [body for kind, body in entry["status"]["messages"] if kind == "execution_error"]
+    assert error["node_type"] == "SaveEnvMap"
+    assert "inside the output folder" in error["exception_message"]
+
+
+def test_interruption_ends_the_run_within_a_step(server: Server) -> None:
+    prompt = workflow("mini_quickstart")
+    for node in prompt.values():
+        if node["class_type"] == "IterativeMedian":
+            node["inputs"] |= {"preset": "paper", "batch_size": 1, "seed": 5}
+    prompt_id = server.post("/prompt", {"prompt": prompt})["prompt_id"]
+    time.sleep(15)
+    assert prompt_id not in server.get_json(f"/history/{prompt_id}")
+    started = time.monotonic()
+    server.post("/interrupt", {})
+    entry = server.wait(prompt_id, timeout=60)
+    assert time.monotonic() - started < 10  # an evaluation of the mini model takes a few tenths of a second
+    kinds = [kind for kind, _ in entry["status"]["messages"]]
+    assert "execution_interrupted" in kinds
+    assert not entry["outputs"] or all("envmaps" not in output for output in entry["outputs"].values())
