@@ -13,14 +13,13 @@ from comfy_api.latest import io
 
 from ..dl_core.errors import ModelError, OptionError
 from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
+from ..dl_core.prompts import DARK_PROMPT, PROMPT
 from .lora import with_lora
 from .sockets import CATEGORY, as_rgb, named_output, parse_evs
 
 __all__ = ["EVPromptInterp", "HDRMerge", "interpolate_conditioning"]
 
 NO_LORA: Final = "none"
-PROMPT: Final = "a perfect mirrored reflective chrome ball sphere"
-DARK_PROMPT: Final = "a perfect black dark mirrored reflective chrome ball sphere"
 
 
 def interpolate_conditioning(original: Any, dark: Any, weight: float) -> Any:

@@ -43,16 +43,9 @@ SAMPLERS: Final[dict[str, Callable[..., Any]]] = {
 Imputing = Literal["initial", "predicted"]
 
 PAPER_DEFAULTS: Final = ModelDefaults(
-    canvas=1024,
-    diameter=256,
-    guidance=5.0,
-    control_scale=0.5,
-    lora_scale=0.75,
-    ev_min=-5.0,
-    prompt="a perfect mirrored reflective chrome ball sphere",
-    dark_prompt="a perfect black dark mirrored reflective chrome ball sphere",
-    negative_prompt="matte, diffuse, flat, dull",
+    canvas=1024, diameter=256, guidance=5.0, control_scale=0.5, lora_scale=0.75, ev_min=-5.0
 )
+"""The paper's, and its authors' code's where the paper is silent."""
 
 
 @dataclass(frozen=True)

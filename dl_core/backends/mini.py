@@ -24,6 +24,7 @@ from torch import nn
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
 from ..errors import ModelError
+from ..prompts import DARK_PROMPT, NEGATIVE_PROMPT, PROMPT
 
 __all__ = [
     "CONTROLNET_CONFIG",
@@ -113,9 +114,9 @@ class ModelDefaults:
     control_scale: float
     lora_scale: float
     ev_min: float
-    prompt: str
-    dark_prompt: str
-    negative_prompt: str
+    prompt: str = PROMPT
+    dark_prompt: str = DARK_PROMPT
+    negative_prompt: str = NEGATIVE_PROMPT
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,8 @@ class MiniModel:
         """The architecture with random weights (global torch seed), no LoRA; tokenizer and defaults from a folder."""
         try:
             values = json.loads((folder / "mini.json").read_text())
-            defaults = ModelDefaults(**{field.name: values[field.name] for field in fields(ModelDefaults)})
-        except (OSError, KeyError, json.JSONDecodeError) as error:
+            defaults = ModelDefaults(**values)
+        except (OSError, TypeError, json.JSONDecodeError) as error:
             raise ModelError(
                 folder / "mini.json", f"cannot be used as the mini model's settings ({error!r})"
             ) from error

@@ -15,9 +15,10 @@ from peft.utils import get_peft_model_state_dict
 from torch import Tensor
 
 from ..backends.mini import MiniModel
+from ..prompts import DARK_PROMPT, PROMPT
 from .denoiser import OFF_BALL_WEIGHT, Batch, TextBank, draw_batch, time_ids, velocity_loss
 from .loop import Budget, train
-from .scenes import BASE_CAPTIONS, DARK_PROMPT, PROMPT, SceneSampler
+from .scenes import BASE_CAPTIONS, SceneSampler
 
 __all__ = ["train_lora"]
 

@@ -24,13 +24,11 @@ from ..geometry import (
     latlong_to_perspective,
     sample_latlong,
 )
+from ..prompts import DARK_PROMPT, NEGATIVE_PROMPT, PROMPT
 from ..shapes import BallImage, Image, Latlong
 
-__all__ = ["BASE_CAPTIONS", "DARK_PROMPT", "NEGATIVE_PROMPT", "PROMPT", "Picture", "SceneSampler"]
+__all__ = ["BASE_CAPTIONS", "Picture", "SceneSampler"]
 
-PROMPT: Final = "a perfect mirrored reflective chrome ball sphere"
-DARK_PROMPT: Final = "a perfect black dark mirrored reflective chrome ball sphere"
-NEGATIVE_PROMPT: Final = "matte, diffuse, flat, dull"
 BASE_CAPTIONS: Final = (PROMPT, DARK_PROMPT, NEGATIVE_PROMPT, "")
 """Everything base training is told, by index."""
 
