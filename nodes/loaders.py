@@ -28,7 +28,8 @@ class MiniProbeLoader(io.ComfyNode):  # type: ignore[misc]
                     min=0.0,
                     max=2.0,
                     step=0.05,
-                    tooltip="How strongly the model's exposure LoRA acts; 0 leaves it out. The paper uses 0.75.",
+                    tooltip="How strongly the model's exposure LoRA acts, where the pack has one; 0 leaves it out. "
+                    "The paper uses 0.75.",
                 ),
             ],
             outputs=[

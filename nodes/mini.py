@@ -109,10 +109,10 @@ def _load(module: torch.nn.Module, weights: Weights, source: str) -> None:
 
 
 def to_model(mini: MiniModel, lora_scale: float) -> Any:
-    """ComfyUI's MODEL of the mini UNet, with the exposure LoRA at a scale (0 leaves it out).
+    """ComfyUI's MODEL of the mini UNet, with its exposure LoRA, where it has one, at a scale (0 leaves it out).
 
     Raises:
-        ModelError: a scale above 0 and no exposure LoRA, or weights that do not fit.
+        ModelError: weights that do not fit.
     """
     config = _MiniSDXL(_MiniSDXL.unet_config)
     # It is small: full precision everywhere costs nothing and spares a model that was trained in it.
@@ -124,10 +124,8 @@ def to_model(mini: MiniModel, lora_scale: float) -> Any:
     patcher = comfy.model_patcher.ModelPatcher(
         model.eval(), load_device=comfy.model_management.get_torch_device(), offload_device=offload
     )
-    if lora_scale == 0:
+    if lora_scale == 0 or mini.lora is None:
         return patcher
-    if mini.lora is None:
-        raise ModelError("mini model's exposure LoRA", "is not in this package; set lora_scale to 0")
     return with_lora(patcher, mini.lora, lora_scale, "mini model's exposure LoRA")
 
 

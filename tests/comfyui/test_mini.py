@@ -142,7 +142,11 @@ def test_loader_without_weights_says_which_file(mini: Any, tmp_path: Any) -> Non
         library.load_mini(tmp_path)
 
 
-def test_lora_scale_without_a_lora_is_refused(mini: Any) -> None:
-    errors = pack_module("dl_core.errors")
-    with pytest.raises(errors.ModelError, match="exposure LoRA"):
-        pack_module("nodes.mini").to_model(replace(mini, lora=None), 0.75)
+def test_model_without_a_lora_is_left_as_it_is(mini: Any) -> None:
+    assert pack_module("nodes.mini").to_model(replace(mini, lora=None), 0.75).patches == {}
+
+
+def test_own_lora_is_loaded_at_its_scale(mini: Any) -> None:
+    weights = {NAMINGS["peft"]("to_q", "down"): torch.ones(4, 128), NAMINGS["peft"]("to_q", "up"): torch.ones(128, 4)}
+    (patch,) = pack_module("nodes.mini").to_model(replace(mini, lora=weights), 0.75).patches.values()
+    assert patch[0][0] == 0.75
