@@ -175,7 +175,8 @@ class DiffusersPainter:
         scheduler.set_timesteps(request.steps, device=self._device)
         begin = first_step(request.steps, request.strength)
         timesteps = scheduler.timesteps[begin * scheduler.order :]
-        scheduler.set_begin_index(begin * scheduler.order)
+        if hasattr(scheduler, "set_begin_index"):  # those that count steps; DDIM reads the timestep it is given
+            scheduler.set_begin_index(begin * scheduler.order)
 
         clean, noise = self._start(request.canvas, seeds)
         mask = ball_latent_mask(request.ball).to(clean)

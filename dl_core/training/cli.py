@@ -50,13 +50,18 @@ class Stage:
     train: Callable[[argparse.Namespace, Report], list[Path]]
 
 
-PANORAMA_ROWS: Final = 128
+SCENE_ROWS: Final = 256
+"""Rows of the drawn scenes, and of the maps the decoder learns detail from."""
+
+SKETCH_ROWS: Final = 128
+"""Rows of the maps behind half-size pictures."""
 
 
 def _sampler(
     args: argparse.Namespace, model: MiniModel, *, scale: int = SKETCH, bracket: bool = False, centred: float = 0.7
 ) -> SceneSampler:
-    bank = load_panoramas(args.panoramas, args.work / "scenes", height=PANORAMA_ROWS)
+    rows = SKETCH_ROWS if scale == SKETCH else SCENE_ROWS
+    bank = load_panoramas(args.panoramas, args.work / "scenes", height=rows)
     canvas, diameter = model.defaults.canvas // scale, model.defaults.diameter // scale
     ev_min = model.defaults.ev_min
     return SceneSampler(bank, canvas, diameter, args.seed, bracket=bracket, centred=centred, ev_min=ev_min)
@@ -68,7 +73,7 @@ def _budget(args: argparse.Namespace) -> Budget:
 
 
 def _data(args: argparse.Namespace, report: Report) -> list[Path]:
-    draw_scenes(args.work / "scenes", args.steps or STAGES["data"].steps, PANORAMA_ROWS, report=report)
+    draw_scenes(args.work / "scenes", args.steps or STAGES["data"].steps, SCENE_ROWS, report=report)
     return [args.work / "scenes"]
 
 
@@ -107,8 +112,8 @@ def _untrained(args: argparse.Namespace) -> MiniModel:
 
 STAGES: Final[dict[str, Stage]] = {
     "data": Stage("draw procedural skies and rooms", 240, 0.0, _data),
-    "vae": Stage("write the closed-form encoder and train the decoder", 2000, 4e-4, _vae),
-    "base": Stage("train UNet and text encoders", 2800, 4e-4, _base),
+    "vae": Stage("write the closed-form encoder and train the decoder", 600, 4e-4, _vae),
+    "base": Stage("train UNet and text encoders", 2400, 4e-4, _base),
     "control": Stage("train the depth ControlNet on the finished base", 400, 4e-4, _control),
     "lora": Stage("train the exposure LoRA on the finished base", 400, 1e-3, _lora),
 }

@@ -1,0 +1,219 @@
+"""DiffusersPainter against diffusers' own inpainting pipeline on the same networks, noise and schedule."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image as PILImage
+from tolerances import assert_close
+from torch import Tensor
+
+from dl_core.backends.diffusers_painter import SAMPLERS, DiffusersPainter, ball_latent_mask
+from dl_core.backends.mini import MiniModel, read_weights
+from dl_core.ball import Ball, crop_ball, paint_depth, place_ball
+from dl_core.errors import ImageError, Interrupted, ModelError, OptionError
+from dl_core.iterative import Rounds, rounds_evaluations
+from dl_core.painter import PaintRequest, SilentObserver
+from dl_core.training.autoencoder import write_closed_form_encoder, write_thumbnail_decoder
+
+SIDE = 128
+
+
+@pytest.fixture(scope="module")
+def model() -> MiniModel:
+    """The mini model's architecture with random weights, every residual of the ControlNet awake."""
+    torch.manual_seed(1)
+    model = MiniModel.untrained()
+    write_closed_form_encoder(model.vae)
+    write_thumbnail_decoder(model.vae)
+    with torch.no_grad():
+        for parameter in model.controlnet.parameters():
+            if not parameter.any():
+                parameter.normal_(std=0.02)
+    return model
+
+
+@pytest.fixture(scope="module")
+def painter(model: MiniModel) -> DiffusersPainter:
+    return DiffusersPainter.from_mini(model, batch=2)
+
+
+@pytest.fixture(scope="module")
+def ball() -> Ball:
+    """A ball whose latent mask is binary: diffusers' pipeline rounds masks, ours keeps the soft edge."""
+    for diameter in range(48, 72, 2):
+        for dilation in range(8):
+            ball = place_ball(SIDE, diameter, dilation=dilation)
+            mask = ball_latent_mask(ball)
+            if bool(((mask == 0) | (mask == 1)).all()):
+                return ball
+    raise AssertionError("no ball of a binary latent mask")
+
+
+@pytest.fixture(scope="module")
+def request_(ball: Ball) -> PaintRequest:
+    canvas = torch.rand(1, SIDE, SIDE, 3, generator=torch.Generator().manual_seed(9))
+    # 8-bit values, since the pipeline is given pictures.
+    canvas = (canvas * 255).round() / 255
+    return PaintRequest(canvas, paint_depth(None, ball), ball, -2.5, (11, 12), strength=1.0, steps=4)
+
+
+def _picture(values: Tensor) -> PILImage.Image:
+    return PILImage.fromarray((values * 255).round().byte().numpy())
+
+
+def _pipeline_balls(painter: DiffusersPainter, request: PaintRequest, sampler: str) -> Tensor:
+    """What diffusers' pipeline paints for a request."""
+    pipeline = painter.pipeline
+    kept, pipeline.scheduler = pipeline.scheduler, SAMPLERS[sampler](pipeline.scheduler.config)
+    guidance = painter.guidance_at(request.ev)
+    count = len(request.seeds)
+    mask = ball_latent_mask(request.ball)[0, 0].repeat_interleave(8, 0).repeat_interleave(8, 1)
+    pipeline.set_progress_bar_config(disable=True)
+    try:
+        canvas = pipeline(
+            image=_picture(request.canvas[0]),
+            mask_image=_picture(mask),
+            control_image=_picture(request.depth[0]),
+            prompt_embeds=guidance.tokens.expand(count, -1, -1),
+            pooled_prompt_embeds=guidance.pooled.expand(count, -1),
+            negative_prompt_embeds=guidance.negative_tokens.expand(count, -1, -1),
+            negative_pooled_prompt_embeds=guidance.negative_pooled.expand(count, -1),
+            guidance_scale=painter.defaults.guidance,
+            controlnet_conditioning_scale=painter.defaults.control_scale,
+            num_inference_steps=request.steps,
+            strength=request.strength,
+            height=SIDE,
+            width=SIDE,
+            generator=[torch.Generator().manual_seed(seed) for seed in request.seeds],
+            output_type="pt",
+        ).images
+    finally:
+        pipeline.scheduler = kept
+    return crop_ball(canvas.permute(0, 2, 3, 1).float(), request.ball)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("strength", [1.0, 0.5])
+def test_balls_equal_those_of_the_pipeline(
+    model: MiniModel, request_: PaintRequest, sampler: str, strength: float
+) -> None:
+    painter = DiffusersPainter.from_mini(model, batch=2, sampler=sampler)
+    asked = replace(request_, strength=strength)
+    painted = painter.paint(asked, SilentObserver()).balls
+    # The pipeline's 8-bit mask and depth are exact here; what remains is rounding over four steps.
+    assert (painted - _pipeline_balls(painter, asked, sampler)).abs().max() < 1e-3
+    assert painted.std() > 0.02
+
+
+class _Count(SilentObserver):
+    def __init__(self, stop_at: int | None = None) -> None:
+        self.total = 0
+        self.stop_at = stop_at
+
+    def evaluated(self, count: int) -> None:
+        self.total += count
+        if self.stop_at is not None and self.total >= self.stop_at:
+            raise Interrupted("stop")
+
+
+class _CountedUNet:
+    """Counts the pictures a UNet really evaluates."""
+
+    def __init__(self, unet: torch.nn.Module) -> None:
+        self.evaluated = 0
+        self.handle = unet.register_forward_pre_hook(self._count)
+
+    def _count(self, unet: torch.nn.Module, arguments: tuple[Tensor, ...]) -> None:
+        self.evaluated += len(arguments[0])
+
+
+@pytest.mark.parametrize(("guidance", "strength"), [(1.0, 1.0), (3.0, 1.0), (3.0, 0.5)])
+def test_the_cost_told_planned_and_reported_is_what_the_unet_does(
+    model: MiniModel, request_: PaintRequest, guidance: float, strength: float
+) -> None:
+    painter = DiffusersPainter.from_mini(model, batch=2)
+    painter.defaults = replace(painter.defaults, guidance=guidance)
+    asked = replace(request_, strength=strength, seeds=(1, 2, 3))
+    counted, observer = _CountedUNet(model.unet), _Count()
+    try:
+        result = painter.paint(asked, observer)
+    finally:
+        counted.handle.remove()
+    planned = painter.evaluations(3, asked.steps, strength)
+    assert counted.evaluated == result.evaluations == observer.total == planned
+
+
+def test_the_paper_costs_9864_evaluations(painter: DiffusersPainter) -> None:
+    assert 3 * rounds_evaluations(painter, Rounds(balls=30, rounds=2, strength=0.8, steps=30)) == 2 * 4932
+
+
+def test_a_ball_does_not_depend_on_its_batch(
+    model: MiniModel, painter: DiffusersPainter, request_: PaintRequest
+) -> None:
+    alone = DiffusersPainter.from_mini(model, batch=1).paint(request_, SilentObserver()).balls
+    assert (alone - painter.paint(request_, SilentObserver()).balls).abs().max() < 1e-4
+
+
+def test_a_seed_fixes_its_ball_and_another_gives_another(painter: DiffusersPainter, request_: PaintRequest) -> None:
+    first, again = (painter.paint(request_, SilentObserver()).balls for _ in range(2))
+    assert torch.equal(first, again)
+    assert (first[0] - first[1]).abs().mean() > 1e-3
+
+
+@pytest.mark.parametrize("stop_at", [1, 9, 16])
+def test_interruption_at_any_step_leaves_the_painter_usable(
+    painter: DiffusersPainter, request_: PaintRequest, stop_at: int
+) -> None:
+    before = painter.paint(request_, SilentObserver()).balls
+    with pytest.raises(Interrupted):
+        painter.paint(request_, _Count(stop_at))
+    assert torch.equal(painter.paint(request_, SilentObserver()).balls, before)
+
+
+def test_guidance_is_on_the_line_between_the_two_original_prompts(painter: DiffusersPainter) -> None:
+    bright, middle, dark = (painter.guidance_at(ev) for ev in (0.0, -1.25, -5.0))
+    assert_close(middle.tokens, bright.tokens * 0.75 + dark.tokens * 0.25)
+    assert_close(middle.pooled, bright.pooled * 0.75 + dark.pooled * 0.25)
+    assert (bright.pooled - dark.pooled).abs().max() > 1e-4
+
+
+def test_imputing_with_the_predicted_noise_is_the_paper_s_listing(model: MiniModel, request_: PaintRequest) -> None:
+    """With DDIM an update of the clean photograph's own noise is what the listing imputes; the two ways differ."""
+    listing = DiffusersPainter.from_mini(model, sampler="ddim", impute="predicted")
+    code = DiffusersPainter.from_mini(model, sampler="ddim")
+    balls = [painter.paint(request_, SilentObserver()).balls for painter in (listing, code)]
+    assert (balls[0] - balls[1]).abs().mean() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"sampler": "ddpm"}, "unipc, ddim, euler"),
+        ({"batch": 0}, "batch"),
+        ({"impute": "predicted", "sampler": "euler"}, "euler"),
+    ],
+)
+def test_options_out_of_range_are_named(model: MiniModel, options: dict[str, object], named: str) -> None:
+    with pytest.raises(OptionError, match=named):
+        DiffusersPainter.from_mini(model, **options)
+
+
+def test_a_canvas_of_another_size_is_refused(painter: DiffusersPainter, request_: PaintRequest) -> None:
+    small = torch.zeros(1, 64, 64, 3)
+    with pytest.raises(ImageError, match="128 x 128"):
+        painter.paint(replace(request_, canvas=small, depth=small), SilentObserver())
+
+
+def test_missing_and_foreign_model_files_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no such file"):
+        DiffusersPainter.from_files(tmp_path / "sdxl.safetensors", tmp_path / "depth.safetensors")
+    broken = tmp_path / "broken.safetensors"
+    broken.write_bytes(b"not a model")
+    with pytest.raises(ModelError, match=r"broken\.safetensors"):
+        DiffusersPainter.from_files(broken, broken)
+    with pytest.raises(ModelError, match=r"broken\.safetensors"):
+        read_weights(broken)
