@@ -1,0 +1,108 @@
+"""What the stages of `lightprobe train` do; their options are in `cli.py`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from ..backends.mini import MINI_FOLDER, MiniModel, load_mini
+from ..imageio import require_writable
+from .base import train_base
+from .control import train_control
+from .decoder import train_decoder
+from .export import write_lora, write_networks
+from .loop import Budget
+from .lora import train_lora
+from .panoramas import draw_scenes, load_panoramas
+from .scenes import SceneSampler
+
+__all__ = ["run_stage"]
+
+Report = Callable[[str], None]
+
+SKETCH: Final = 2
+"""The denoiser sees blocks of 8 pixels only; pictures at half size give it the same for a quarter of the work."""
+
+SCENE_ROWS: Final = 256
+"""Rows of the drawn scenes, and of the maps the decoder learns detail from."""
+
+SKETCH_ROWS: Final = 128
+"""Rows of the maps behind half-size pictures."""
+
+
+def _sampler(
+    args: argparse.Namespace, model: MiniModel, *, scale: int = SKETCH, bracket: bool = False, centred: float = 0.7
+) -> SceneSampler:
+    rows = SKETCH_ROWS if scale == SKETCH else SCENE_ROWS
+    bank = load_panoramas(args.panoramas, args.work / "scenes", height=rows)
+    canvas, diameter = model.defaults.canvas // scale, model.defaults.diameter // scale
+    ev_min = model.defaults.ev_min
+    return SceneSampler(bank, canvas, diameter, args.seed, bracket=bracket, centred=centred, ev_min=ev_min)
+
+
+def _budget(args: argparse.Namespace) -> Budget:
+    return Budget(args.steps, args.learning_rate)
+
+
+def _data(args: argparse.Namespace, report: Report) -> list[Path]:
+    draw_scenes(args.work / "scenes", args.steps, SCENE_ROWS, report=report)
+    return [args.work / "scenes"]
+
+
+def _vae(args: argparse.Namespace, report: Report) -> list[Path]:
+    model = _untrained(args)
+    sampler = _sampler(args, model, scale=1, bracket=True)
+    weights = train_decoder(model, sampler, _budget(args), args.work / "vae", batch=args.batch, report=report)
+    return write_networks(args.out, weights)
+
+
+def _base(args: argparse.Namespace, report: Report) -> list[Path]:
+    model = _untrained(args)
+    sampler = _sampler(args, model)
+    weights = train_base(model, sampler, _budget(args), args.work / "base", batch=args.batch, report=report)
+    return write_networks(args.out, weights)
+
+
+def _control(args: argparse.Namespace, report: Report) -> list[Path]:
+    model = load_mini(args.out, without=("controlnet",))
+    sampler = _sampler(args, model, centred=0.3)
+    weights = train_control(model, sampler, _budget(args), args.work / "control", batch=args.batch, report=report)
+    return write_networks(args.out, weights)
+
+
+def _lora(args: argparse.Namespace, report: Report) -> list[Path]:
+    model = load_mini(args.out, without=("controlnet",))
+    sampler = _sampler(args, model, bracket=True)
+    weights = train_lora(model, sampler, _budget(args), args.work / "lora", batch=args.batch, report=report)
+    return [write_lora(args.out, weights)]
+
+
+def _untrained(args: argparse.Namespace) -> MiniModel:
+    torch.manual_seed(args.seed)
+    return MiniModel.untrained(args.out)
+
+
+_STAGES: Final[dict[str, Callable[[argparse.Namespace, Report], list[Path]]]] = {
+    "data": _data,
+    "vae": _vae,
+    "base": _base,
+    "control": _control,
+    "lora": _lora,
+}
+
+
+def run_stage(args: argparse.Namespace, report: Report) -> list[Path]:
+    """Run a stage with steps and learning rate filled in; returns what it wrote.
+
+    Raises:
+        OptionError: an option that is not accepted, named as on the command line.
+        ModelError: a network the stage builds on is not there yet.
+        OutputError: a folder cannot be written; said before any training.
+    """
+    args.out = args.out or MINI_FOLDER
+    require_writable(args.out / "mini.json")
+    return _STAGES[args.stage](args, report)
