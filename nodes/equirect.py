@@ -61,7 +61,7 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
     ) -> io.NodeOutput:
         """Cut out, unwrap, turn."""
         crop = _cut_out(as_rgb(image, "image"), ball)
-        latlong = ball_to_latlong(crop, height, samples=samples)
+        latlong = ball_to_latlong(crop, height, samples=samples, painted=True)
         coverage = _coverage(height, crop.shape[1])
         if yaw % 360:
             rotation = camera_rotation(yaw=yaw)
