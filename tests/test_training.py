@@ -15,6 +15,7 @@ from dl_core.backends.mini import MiniModel
 from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
 from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
+from dl_core.training.control import train_control
 from dl_core.training.decoder import train_decoder
 from dl_core.training.denoiser import draw_batch
 from dl_core.training.export import write_networks
@@ -224,3 +225,18 @@ def test_procedural_panoramas_are_radiance_with_light_above(seed: int) -> None:
     assert torch.isfinite(panorama).all()
     assert panorama.min() >= 0
     assert panorama[:, :16].sum() > panorama[:, 16:].sum()
+
+
+def test_control_training_wakes_the_controlnet_and_gives_a_whole_one(panoramas: Tensor, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = MiniModel.untrained()
+    sampler = SceneSampler(panoramas, 128, 64, seed=1)
+    weights = train_control(model, sampler, Budget(3, 1e-3, warmup=1), tmp_path, batch=1, report=lambda text: None)
+    fresh = MiniModel.untrained()
+    fresh.controlnet.load_state_dict(weights["controlnet"])
+    fresh.unet.load_state_dict(weights["unet"])
+    seen = fresh.controlnet.controlnet_cond_embedding.state_dict()
+    assert torch.equal(seen["blocks.3.weight"], model.controlnet.controlnet_cond_embedding.blocks[3].weight)
+    assert fresh.controlnet.controlnet_mid_block.weight.abs().max() > 0
+    # The last look layer starts at zero behind residuals that do: it hears of the loss from the second step on.
+    assert seen["conv_out.weight"].abs().max() > 0

@@ -34,7 +34,7 @@ STAGES: Final[dict[str, Stage]] = {
     "data": Stage("draw procedural skies and rooms", 240, 0.0),
     "vae": Stage("write the closed-form encoder and train the decoder", 600, 4e-4),
     "base": Stage("train UNet and text encoders", 2400, 4e-4),
-    "control": Stage("train the depth ControlNet on the finished base", 400, 4e-4),
+    "control": Stage("train the depth ControlNet, and the base further with it", 1600, 3e-4),
     "lora": Stage("train the exposure LoRA on the finished base", 400, 1e-3),
 }
 

@@ -70,21 +70,24 @@ def time_ids(count: int, side: int) -> Float[Tensor, "b 6"]:
     return torch.tensor([[side, side, 0, 0, side, side]], dtype=torch.float32).expand(count, -1)
 
 
-def draw_batch(
-    sampler: SceneSampler, step: int, size: int, *, full_canvas: int, timesteps: tuple[int, int] = (0, 1000)
-) -> Batch:
+def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int, noisiest: float = 0.33) -> Batch:
     """The batch of a step; it follows from the sampler's seed and the step alone.
 
-    A third of the noise levels fall in the noisiest 30%, where the layout of light is settled.
+    Args:
+        sampler: draws the pictures.
+        step: of the training.
+        size: pictures in the batch.
+        full_canvas: side of the canvas the model paints on; the sampler's may be smaller.
+        noisiest: share drawn from the noisiest 40% of levels, where the layout of light is settled; the rest are
+            spread over all.
     """
     scale = full_canvas // sampler.canvas
     pictures = [sampler.draw(step * size + i) for i in range(size)]
     clean = block_latents(torch.cat([picture.canvas_ldr for picture in pictures]), 8 // scale)
     generator = torch.Generator().manual_seed(sampler.seed * 7_919 + step)
-    low, high = timesteps
-    levels = torch.randint(low, high, (size,), generator=generator)
-    noisiest = torch.randint(low + (high - low) * 7 // 10, high, (size,), generator=generator)
-    levels = torch.where(torch.rand(size, generator=generator) < 0.33, noisiest, levels)
+    levels = torch.randint(0, 1000, (size,), generator=generator)
+    high_levels = torch.randint(600, 1000, (size,), generator=generator)
+    levels = torch.where(torch.rand(size, generator=generator) < noisiest, high_levels, levels)
     noise = torch.randn(clean.shape, generator=generator)
     scheduler = DDPMScheduler(**SCHEDULER_CONFIG)
     return Batch(

@@ -54,14 +54,14 @@ def _data(args: argparse.Namespace, report: Report) -> list[Path]:
 
 
 def _vae(args: argparse.Namespace, report: Report) -> list[Path]:
-    model = _untrained(args)
+    model = MiniModel.untrained(args.out)
     sampler = _sampler(args, model, scale=1, bracket=True)
     weights = train_decoder(model, sampler, _budget(args), args.work / "vae", batch=args.batch, report=report)
     return write_networks(args.out, weights)
 
 
 def _base(args: argparse.Namespace, report: Report) -> list[Path]:
-    model = _untrained(args)
+    model = MiniModel.untrained(args.out)
     sampler = _sampler(args, model)
     weights = train_base(model, sampler, _budget(args), args.work / "base", batch=args.batch, report=report)
     return write_networks(args.out, weights)
@@ -69,7 +69,7 @@ def _base(args: argparse.Namespace, report: Report) -> list[Path]:
 
 def _control(args: argparse.Namespace, report: Report) -> list[Path]:
     model = load_mini(args.out, without=("controlnet",))
-    sampler = _sampler(args, model, centred=0.3)
+    sampler = _sampler(args, model, centred=0.85)
     weights = train_control(model, sampler, _budget(args), args.work / "control", batch=args.batch, report=report)
     return write_networks(args.out, weights)
 
@@ -79,11 +79,6 @@ def _lora(args: argparse.Namespace, report: Report) -> list[Path]:
     sampler = _sampler(args, model, bracket=True)
     weights = train_lora(model, sampler, _budget(args), args.work / "lora", batch=args.batch, report=report)
     return [write_lora(args.out, weights)]
-
-
-def _untrained(args: argparse.Namespace) -> MiniModel:
-    torch.manual_seed(args.seed)
-    return MiniModel.untrained(args.out)
 
 
 _STAGES: Final[dict[str, Callable[[argparse.Namespace, Report], list[Path]]]] = {
@@ -105,4 +100,5 @@ def run_stage(args: argparse.Namespace, report: Report) -> list[Path]:
     """
     args.out = args.out or MINI_FOLDER
     require_writable(args.out / "mini.json")
+    torch.manual_seed(args.seed)  # random starts: a resumed run builds the same ones
     return _STAGES[args.stage](args, report)
