@@ -30,12 +30,26 @@ COMFYUI = Path(os.environ.get("COMFYUI_PATH", Path.home() / "ComfyUI"))
 STANDIN = REPOSITORY / "tests" / "comfyui" / "standin"
 PHOTO = REPOSITORY / "dl_core" / "data" / "photos" / "coffee.jpg"
 PACK = "lightprobe_pack"
-NO_COMFYUI = f"NO COMFYUI: {COMFYUI} holds none, its tests are skipped; set COMFYUI_PATH"
+REQUIREMENTS = ("aiohttp", "alembic", "av", "comfyui_frontend_package", "einops", "psutil", "sqlalchemy", "torchsde")
+"""What ComfyUI needs and this package does not."""
+
+
+def _absence() -> str:
+    """Why ComfyUI cannot be tested against; empty if it can."""
+    if not ((COMFYUI / "main.py").is_file() and (COMFYUI / "comfy_api").is_dir()):
+        return f"NO COMFYUI: {COMFYUI} holds none, its tests are skipped; set COMFYUI_PATH"
+    missing = [name for name in REQUIREMENTS if importlib.util.find_spec(name) is None]
+    if missing:
+        return f"NO COMFYUI: this environment lacks {', '.join(missing)}, its tests are skipped; see .ci/run"
+    return ""
+
+
+NO_COMFYUI = _absence()
 
 
 def installed() -> bool:
-    """Whether there is a ComfyUI to test against."""
-    return (COMFYUI / "main.py").is_file() and (COMFYUI / "comfy_api").is_dir()
+    """Whether there is a ComfyUI to test against, with what it needs."""
+    return not NO_COMFYUI
 
 
 # --- in this process ---------------------------------------------------------------------------------------------
