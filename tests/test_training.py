@@ -70,7 +70,7 @@ def test_unevenness_is_nothing_on_flat_blocks_and_grows_with_a_light() -> None:
     assert latents[3, 3].argmax() == (20 // 8) * 8 + 40 // 8
 
 
-def test_the_untrained_decoder_paints_blocks_in_their_mean_colour(vae: AutoencoderTiny) -> None:
+def test_the_untrained_decoder_paints_the_blocks_mean_colours(vae: AutoencoderTiny) -> None:
     flat = torch.rand(1, 1, 1, 3, generator=torch.Generator().manual_seed(5)) * 0.4 + 0.3
     latents = block_latents(flat.expand(1, 64, 64, 3).contiguous())
     with torch.no_grad():

@@ -152,12 +152,13 @@ OFFSET: Final = 0.5
 
 @torch.no_grad()
 def write_thumbnail_decoder(vae: AutoencoderTiny) -> None:
-    """Start the decoder as one that paints each block in its mean colour, the other channels at random.
+    """Start the decoder as one that interpolates the blocks' mean colours, the other channels at random.
 
-    Colours are then right from the first step, and training adds what lies between the blocks.
+    Colours are then right and edges of blocks soft from the first step; training adds what lies between the blocks.
     """
     layers: list[Any] = list(vae.decoder.layers)
     first, last = layers[0], layers[-1]
+    tent = torch.outer(torch.tensor([0.25, 0.5, 0.25]), torch.tensor([0.25, 0.5, 0.25]))
     inverse = torch.linalg.inv(
         torch.stack((torch.tensor(LUMA), torch.eye(3)[0] - torch.tensor(LUMA), torch.eye(3)[2] - torch.tensor(LUMA)))
     )
@@ -167,8 +168,9 @@ def write_thumbnail_decoder(vae: AutoencoderTiny) -> None:
     first.bias[_RGB] = inverse[:, 0] * LUMA_MIDDLE + OFFSET
     for layer in layers:
         if isinstance(layer, nn.Conv2d) and layer not in (first, last):
+            # After each nearest-neighbour doubling: together they interpolate linearly.
             layer.weight[_RGB] = 0
-            _pass_rgb(layer)
+            layer.weight[range(3), range(3)] = tent
         elif hasattr(layer, "conv"):
             layer.conv[4].weight[_RGB] = 0
             layer.conv[4].bias[_RGB] = 0
