@@ -24,12 +24,12 @@ class MiniProbeLoader(io.ComfyNode):  # type: ignore[misc]
             inputs=[
                 io.Float.Input(
                     "lora_scale",
-                    default=0.75,
+                    default=1.0,
                     min=0.0,
                     max=2.0,
                     step=0.05,
                     tooltip="How strongly the model's exposure LoRA acts, where the pack has one; 0 leaves it out. "
-                    "The paper uses 0.75.",
+                    "It was trained to act at 1; the paper's is used at 0.75.",
                 ),
             ],
             outputs=[

@@ -15,7 +15,7 @@ FILE_INPUTS = {
     ("LoadImage", "image"),
     ("CheckpointLoaderSimple", "ckpt_name"),
     ("ControlNetLoader", "control_net_name"),
-    ("EVPromptInterp", "lora"),
+    ("LoraLoader", "lora_name"),
 }
 """Inputs that name a file of the user's: their values need not be on offer."""
 
@@ -88,7 +88,8 @@ def test_paper_workflow_has_the_papers_settings() -> None:
     assert {name: paint[name] for name in wanted} == wanted
     assert (nodes["DepthBallMask"]["canvas"], nodes["DepthBallMask"]["diameter"]) == (1024, 256)
     assert nodes["EVPromptInterp"]["evs"] == "0, -2.5, -5"
-    assert nodes["EVPromptInterp"]["lora_scale"] == 0.75
+    assert (nodes["LoraLoader"]["strength_model"], nodes["LoraLoader"]["strength_clip"]) == (0.75, 0.0)
+    assert nodes["EVPromptInterp"]["lora"] == "none"
     assert nodes["HDRMerge"]["method"] == "paper"
 
 
