@@ -7,9 +7,8 @@ and `first_stage_model`.
 
 How it differs from the paper's Algorithm 0 in its authors' code. Outside the mask both hold the photograph's latent
 with the same initial noise at the level of every evaluation (there: put in after a step; here: before an evaluation,
-which is the same moment). At strength 1 the first evaluation there sees pure noise everywhere; here the photograph is
-already around the disc. On cells the mask covers partly, here the estimate is blended with the clean latent too. The
-autoencoder's mode is encoded, not a sample.
+which is the same moment). At strength 1 the first evaluation sees noise alone, as there (`_FromNoise`). On cells the
+mask covers partly, here the estimate is blended with the clean latent too. The autoencoder's mode is encoded, not a sample.
 """
 
 from __future__ import annotations
@@ -262,11 +261,7 @@ def _noise(seeds: tuple[int, ...], latent: torch.Tensor) -> torch.Tensor:
 
 
 def _sampler(name: str, model: Any, *, from_noise: bool) -> Any:
-    """ComfyUI's sampler of a name; with `from_noise` it starts from noise alone.
-
-    ComfyUI adds noise to the latent it is given, which lets the photograph shine through the first level of noise
-    where the method wants a ball from nothing.
-    """
+    """ComfyUI's sampler of a name; with `from_noise` it starts from noise alone (see `_FromNoise`)."""
     sampler = comfy.samplers.sampler_object(name)
     if not from_noise:
         return sampler
@@ -274,9 +269,30 @@ def _sampler(name: str, model: Any, *, from_noise: bool) -> Any:
 
     def start_from_noise(inpaint: Any, x: torch.Tensor, sigmas: torch.Tensor, **options: Any) -> torch.Tensor:
         noise = sampling.noise_scaling(sigmas[0], inpaint.noise, torch.zeros_like(x), True)
-        return sampler.sampler_function(inpaint, noise, sigmas, **options)
+        return sampler.sampler_function(_FromNoise(inpaint), noise, sigmas, **options)
 
     return comfy.samplers.KSAMPLER(start_from_noise, sampler.extra_options, sampler.inpaint_options)
+
+
+class _FromNoise:
+    """ComfyUI's inpainting denoiser, seeing noise alone at its first evaluation.
+
+    ComfyUI adds noise to the photograph's latent around the mask from the first evaluation on; the authors' code
+    starts from noise everywhere and puts the photograph in after the first step.
+    """
+
+    def __init__(self, inpaint: Any) -> None:
+        self._inpaint, self._latent = inpaint, inpaint.latent_image
+        inpaint.latent_image = torch.zeros_like(self._latent)
+
+    def __call__(self, *arguments: Any, **options: Any) -> torch.Tensor:
+        try:
+            return self._inpaint(*arguments, **options)  # type: ignore[no-any-return]
+        finally:
+            self._inpaint.latent_image = self._latent
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inpaint, name)
 
 
 def _decode_ball(vae: Any, samples: torch.Tensor, ball: Ball) -> BallImage:
