@@ -8,7 +8,8 @@ and `first_stage_model`.
 How it differs from the paper's Algorithm 0 in its authors' code. Outside the mask both hold the photograph's latent
 with the same initial noise at the level of every evaluation (there: put in after a step; here: before an evaluation,
 which is the same moment). At strength 1 the first evaluation sees noise alone, as there (`_FromNoise`). On cells the
-mask covers partly, here the estimate is blended with the clean latent too. The autoencoder's mode is encoded, not a sample.
+mask covers partly, here the estimate is blended with the clean latent too. The autoencoder's mode is encoded, not a
+sample.
 """
 
 from __future__ import annotations
