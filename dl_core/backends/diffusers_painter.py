@@ -162,14 +162,17 @@ class DiffusersPainter:
         """
         require_canvas(request.canvas, request.ball)
         balls, spent = [], 0
+        encoded = self._encode(request.canvas)
         for start in range(0, len(request.seeds), self.batch):
             seeds = request.seeds[start : start + self.batch]
-            latents, evaluations = self._inpaint(request, seeds, observer)
+            latents, evaluations = self._inpaint(request, encoded, seeds, observer)
             balls.append(self._decode_ball(latents, request.ball))
             spent += evaluations
         return PaintResult(torch.cat(balls), spent)
 
-    def _inpaint(self, request: PaintRequest, seeds: tuple[int, ...], observer: Observer) -> tuple[Tensor, int]:
+    def _inpaint(
+        self, request: PaintRequest, encoded: Any, seeds: tuple[int, ...], observer: Observer
+    ) -> tuple[Tensor, int]:
         """Algorithm 0 for a batch of balls; returns latents (n, 4, h, w) and the denoiser evaluations spent."""
         scheduler = SAMPLERS[self.sampler](self.pipeline.scheduler.config)
         scheduler.set_timesteps(request.steps, device=self._device)
@@ -178,7 +181,7 @@ class DiffusersPainter:
         if hasattr(scheduler, "set_begin_index"):  # those that count steps; DDIM reads the timestep it is given
             scheduler.set_begin_index(begin * scheduler.order)
 
-        clean, noise = self._start(request.canvas, seeds)
+        clean, noise = self._start(encoded, seeds)
         mask = ball_latent_mask(request.ball).to(clean)
         latents = (
             noise * scheduler.init_noise_sigma
@@ -199,19 +202,22 @@ class DiffusersPainter:
             observer.evaluated(per_step)
         return latents, per_step * len(timesteps)
 
-    def _start(self, canvas: Image, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    def _encode(self, canvas: Image) -> Any:
+        """What the autoencoder makes of the canvas: latents, or a distribution to sample them from."""
+        vae = self.pipeline.vae
+        return vae.encode((canvas.permute(0, 3, 1, 2) * 2 - 1).to(self._device, vae.dtype))
+
+    def _start(self, encoded: Any, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Clean latents of the canvas and initial noise of each ball, (n, 4, h, w) each.
 
         A sampling autoencoder draws from the ball's generator before the noise does, as in the authors' code.
         """
-        vae = self.pipeline.vae
-        pixels = (canvas.permute(0, 3, 1, 2) * 2 - 1).to(self._device, vae.dtype)
-        encoded = vae.encode(pixels)
+        scale = self.pipeline.vae.config.scaling_factor
         clean, noise = [], []
         for seed in seeds:
             generator = torch.Generator().manual_seed(seed)
             sample = encoded.latent_dist.sample(generator) if hasattr(encoded, "latent_dist") else encoded.latents
-            clean.append(sample * vae.config.scaling_factor)
+            clean.append(sample * scale)
             noise.append(torch.randn(sample.shape, generator=generator).to(sample))
         return torch.cat(clean), torch.cat(noise)
 
