@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -24,6 +27,8 @@ from dl_core.training.lora import train_lora
 from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
 from dl_core.training.procedural import draw_panorama
 from dl_core.training.scenes import SceneSampler
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -240,3 +245,41 @@ def test_control_training_wakes_the_controlnet_and_gives_a_whole_one(panoramas: 
     assert fresh.controlnet.controlnet_mid_block.weight.abs().max() > 0
     # The last look layer starts at zero behind residuals that do: it hears of the loss from the second step on.
     assert seen["conv_out.weight"].abs().max() > 0
+
+
+SHARED_STEPS = """
+import json, sys, torch
+from pathlib import Path
+from accelerate import PartialState
+from dl_core.training.loop import Budget, train
+
+PartialState(cpu=True)
+torch.manual_seed(0)
+network = torch.nn.Linear(3, 2)
+
+
+def loss_of_batch(number):
+    given = torch.randn(4, 3, generator=torch.Generator().manual_seed(number))
+    return (network(given) - given[:, :2]).square().mean()
+
+
+def loss_of_step(step):
+    return loss_of_batch(step) if int(sys.argv[2]) == 1 else (loss_of_batch(2 * step) + loss_of_batch(2 * step + 1)) / 2
+
+
+weights = train({"net": network}, loss_of_step, Budget(12, 1e-2, warmup=2), Path(sys.argv[1]), report=lambda line: None)
+if PartialState().is_main_process:
+    Path(sys.argv[1], "weights.json").write_text(json.dumps(weights["net"]["weight"].tolist()))
+"""
+
+
+def test_two_processes_train_as_one_with_batches_twice_as_large(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SHARED_STEPS)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    for launcher, folder, batches in ((torchrun, "two", "1"), ([sys.executable], "one", "2")):
+        subprocess.run([*launcher, str(script), str(tmp_path / folder), batches], check=True, env=environment)
+    two, one = (torch.tensor(json.loads((tmp_path / name / "weights.json").read_text())) for name in ("two", "one"))
+    torch.testing.assert_close(two, one)
+    assert len((tmp_path / "two" / "log.jsonl").read_text().splitlines()) == 1  # the second process stays silent

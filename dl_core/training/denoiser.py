@@ -70,7 +70,7 @@ def time_ids(count: int, side: int) -> Float[Tensor, "b 6"]:
     return torch.tensor([[side, side, 0, 0, side, side]], dtype=torch.float32).expand(count, -1)
 
 
-def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int, noisiest: float = 0.33) -> Batch:
+def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int, noisiest: float = 0.5) -> Batch:
     """The batch of a step; it follows from the sampler's seed and the step alone.
 
     Args:

@@ -1,4 +1,8 @@
-"""A training loop that can be killed at any moment: seeded, checkpointed, resumed where it stood."""
+"""A training loop that can be killed at any moment: seeded, checkpointed, resumed where it stood.
+
+Under `torchrun` the processes share every step: each draws its own batch and the gradients are averaged, so P processes
+train as one would with batches P times as large.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from accelerate import PartialState
+from accelerate.utils import reduce
 from torch import Tensor, nn
 
 from ..errors import Interrupted, OptionError
@@ -48,10 +54,20 @@ class Budget:
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
-def average_weights(average: Tensor, current: Tensor, step: int, horizon: float = 0.998) -> None:
-    """Move an exponential average of weights towards the current ones; early steps are forgotten faster."""
+@torch.no_grad()
+def average_weights(averages: list[Tensor], weights: list[Tensor], step: int, horizon: float = 0.998) -> None:
+    """Move exponential averages of weights towards the current ones; early steps are forgotten faster."""
     decay = min(horizon, (1 + step) / (10 + step))
-    average.lerp_(current, 1 - decay)
+    torch._foreach_lerp_(averages, weights, 1 - decay)
+
+
+def _share_gradients(weights: list[Tensor]) -> None:
+    """Give every process the mean of all processes' gradients; a weight its batch did not touch counts as zero."""
+    for weight in weights:
+        weight.grad = torch.zeros_like(weight) if weight.grad is None else weight.grad
+    shared = reduce(torch.cat([weight.grad.flatten() for weight in weights]), reduction="mean")
+    for weight, mean in zip(weights, shared.split([weight.numel() for weight in weights]), strict=True):
+        weight.grad.copy_(mean.view_as(weight))
 
 
 def train(
@@ -66,8 +82,8 @@ def train(
 
     Args:
         networks: what is trained; parameters without `requires_grad` stay as they are.
-        loss_of_step: the loss of a step's batch; it must follow from the step number alone, so that a resumed run
-            sees what the killed one would have seen.
+        loss_of_step: the loss of a batch, by its number; it must follow from the number alone, so that a resumed run
+            sees what the killed one would have seen. There is a batch per step and process.
         budget: steps and learning rate.
         folder: for `checkpoint.pt` and `log.jsonl` (step, loss, seconds).
         report: told of progress about every ten seconds.
@@ -85,24 +101,28 @@ def train(
         for key, parameter in network.named_parameters()
         if parameter.requires_grad
     }
-    optimizer = torch.optim.AdamW(trained.values(), lr=budget.learning_rate, betas=(0.9, 0.99), weight_decay=0.01)
+    weights = list(trained.values())
+    optimizer = torch.optim.AdamW(weights, lr=budget.learning_rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True)
     averages = {name: parameter.detach().clone() for name, parameter in trained.items()}
     step = _resume(folder, networks, optimizer, averages)
+    processes = PartialState(cpu=not torch.cuda.is_available())
     losses: list[float] = []
     spoken = saved = started = time.monotonic()
     try:
         while step < budget.steps:
             for group in optimizer.param_groups:
                 group["lr"] = budget.rate(step)
-            loss = loss_of_step(step)
+            loss = loss_of_step(step * processes.num_processes + processes.process_index)
             loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(trained.values(), 1.0)
+            if processes.num_processes > 1:
+                _share_gradients(weights)
+            nn.utils.clip_grad_norm_(weights, 1.0)
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
             step += 1
-            with torch.no_grad():
-                for name, parameter in trained.items():
-                    average_weights(averages[name], parameter, step)
+            average_weights(list(averages.values()), weights, step)
+            if not processes.is_main_process:
+                continue
             losses.append(float(loss.detach()))
             now = time.monotonic()
             if now - spoken > 10 or step == budget.steps:
@@ -113,9 +133,11 @@ def train(
                 _save(folder, step, networks, optimizer, averages)
                 saved = now
     except KeyboardInterrupt as error:
-        _save(folder, step, networks, optimizer, averages)
+        if processes.is_main_process:
+            _save(folder, step, networks, optimizer, averages)
         raise Interrupted(f"training stopped at step {step}; run the same command again to go on") from error
-    _save(folder, step, networks, optimizer, averages)
+    if processes.is_main_process:
+        _save(folder, step, networks, optimizer, averages)
     return _averaged(networks, averages)
 
 
