@@ -104,7 +104,7 @@ class DiffusersPainter:
         self.sampler = sampler
         self.batch = batch
         self.impute = impute
-        self._guidance: dict[float, Guidance] = {}
+        self._embeddings: dict[str, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
 
     @staticmethod
     def from_mini(model: MiniModel, **options: Any) -> DiffusersPainter:
@@ -265,23 +265,24 @@ class DiffusersPainter:
 
     def guidance_at(self, ev: float) -> Guidance:
         """Embeddings at an EV: ξ(ev) = ξ_o + (ev / EV_min) (ξ_d - ξ_o), tokens and pooled alike (Sec. 4.2)."""
-        if ev not in self._guidance:
-            own, unwanted, own_pooled, unwanted_pooled = self._embed(self.defaults.prompt)
-            dark, _, dark_pooled, _ = self._embed(self.defaults.dark_prompt)
-            share = ev / self.defaults.ev_min
-            self._guidance[ev] = Guidance(
-                torch.lerp(own, dark, share), torch.lerp(own_pooled, dark_pooled, share), unwanted, unwanted_pooled
-            )
-        return self._guidance[ev]
+        own, unwanted, own_pooled, unwanted_pooled = self._embed(self.defaults.prompt)
+        dark, _, dark_pooled, _ = self._embed(self.defaults.dark_prompt)
+        share = ev / self.defaults.ev_min
+        return Guidance(
+            torch.lerp(own, dark, share), torch.lerp(own_pooled, dark_pooled, share), unwanted, unwanted_pooled
+        )
 
     @torch.no_grad()
     def _embed(self, prompt: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.pipeline.encode_prompt(  # type: ignore[no-any-return]
-            prompt,
-            device=self._device,
-            do_classifier_free_guidance=True,
-            negative_prompt=self.defaults.negative_prompt,
-        )
+        """Token embeddings of a prompt and of the negative one, then the pooled ones; encoded once."""
+        if prompt not in self._embeddings:
+            self._embeddings[prompt] = self.pipeline.encode_prompt(
+                prompt,
+                device=self._device,
+                do_classifier_free_guidance=True,
+                negative_prompt=self.defaults.negative_prompt,
+            )
+        return self._embeddings[prompt]
 
     def _decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
         vae = self.pipeline.vae

@@ -21,6 +21,8 @@ from .scenes import BASE_CAPTIONS, SceneSampler
 
 __all__ = ["OFF_BALL_WEIGHT", "Batch", "TextBank", "draw_batch", "time_ids", "velocity_loss"]
 
+_NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
+
 OFF_BALL_WEIGHT = 0.3
 """Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""
 
@@ -89,11 +91,10 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     high_levels = torch.randint(600, 1000, (size,), generator=generator)
     levels = torch.where(torch.rand(size, generator=generator) < noisiest, high_levels, levels)
     noise = torch.randn(clean.shape, generator=generator)
-    scheduler = DDPMScheduler(**SCHEDULER_CONFIG)
     return Batch(
-        noisy=scheduler.add_noise(clean, noise, levels),
+        noisy=_NOISE.add_noise(clean, noise, levels),
         timesteps=levels,
-        target=scheduler.get_velocity(clean, noise, levels),
+        target=_NOISE.get_velocity(clean, noise, levels),
         weights=torch.cat([_weights(picture.ball, clean.shape[-1]) for picture in pictures]),
         captions=torch.tensor([picture.caption for picture in pictures]),
         evs=torch.tensor([picture.ev for picture in pictures]),
