@@ -15,7 +15,8 @@ from analytic_painter import AnalyticPainter
 from PIL import Image as PILImage
 
 from dl_core import __version__, cli
-from dl_core.commands import estimate, estimating
+from dl_core.backends.loading import BACKENDS, Backend, LoadedPainter
+from dl_core.commands import estimate
 from dl_core.errors import Interrupted, ModelError
 from dl_core.exposure import MERGES, encode_display
 from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_ball
@@ -66,12 +67,12 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Adds a row `true` to the table of backends: a painter without error on a 256 pixel canvas."""
 
     def add(painter: Painter | None = None, load_error: BaseException | None = None) -> None:
-        def load(args: object) -> estimating.LoadedPainter:
+        def load(args: object) -> LoadedPainter:
             if load_error is not None:
                 raise load_error
-            return estimating.LoadedPainter(painter or AnalyticPainter(sun_and_sky()), 256, 128)
+            return LoadedPainter(painter or AnalyticPainter(sun_and_sky()), 256, 128)
 
-        monkeypatch.setitem(estimating.BACKENDS, "true", estimating.Backend("paints the truth", load))
+        monkeypatch.setitem(BACKENDS, "true", Backend("paints the truth", load))
 
     return add
 
@@ -316,10 +317,10 @@ def test_help_names_what_the_tables_hold(capsys: pytest.CaptureFixture[str]) -> 
     with pytest.raises(SystemExit):
         cli.main(["estimate", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    for name in (*PRESETS, *MERGES, *estimating.BACKENDS):
+    for name in (*PRESETS, *MERGES, *BACKENDS):
         assert name in text
     assert next(iter(MERGES)) == "channel"
-    assert next(iter(estimating.BACKENDS)) == "mini"
+    assert next(iter(BACKENDS)) == "mini"
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)

@@ -14,6 +14,7 @@ from typing import Any, Final
 from tqdm import tqdm
 
 from .. import __version__
+from ..backends.loading import ModelFiles, choose_backend
 from ..errors import OptionError
 from ..estimate import Probe, Settings, estimate, planned_evaluations
 from ..exposure import check_evs, check_merge
@@ -23,74 +24,7 @@ from ..presets import preset
 from ..shapes import Image
 from ..spheres import sphere_sheet
 
-__all__ = ["BACKENDS", "Backend", "LoadedPainter", "probe_metadata", "run"]
-
-
-@dataclass(frozen=True)
-class LoadedPainter:
-    """A painter and the canvas it wants.
-
-    Attributes:
-        painter: paints balls.
-        canvas: side of the canvas, pixels.
-        diameter: of the ball, pixels, unless another is asked for.
-    """
-
-    painter: Painter
-    canvas: int
-    diameter: int
-
-
-@dataclass(frozen=True)
-class Backend:
-    """A family of diffusion models.
-
-    Attributes:
-        summary: one line for people.
-        load: from the options `--model`, `--controlnet` and `--lora`.
-    """
-
-    summary: str
-    load: Callable[[argparse.Namespace], LoadedPainter]
-
-
-def _quiet_libraries() -> None:
-    """Leave the terminal to the progress bar: these libraries announce what they fall back to without torchvision."""
-    from diffusers.utils import logging as diffusers_logging
-    from transformers.utils import logging as transformers_logging
-
-    diffusers_logging.set_verbosity_error()
-    transformers_logging.set_verbosity_error()
-
-
-def _load_mini(args: argparse.Namespace) -> LoadedPainter:
-    for name in ("controlnet", "lora"):
-        if getattr(args, name) is not None:
-            raise OptionError(name, getattr(args, name), "nothing with the backend mini: its folder holds all of it")
-    _quiet_libraries()
-    from ..backends.diffusers_painter import DiffusersPainter
-    from ..backends.mini import MINI_FOLDER, load_mini
-
-    model = load_mini(Path(args.model) if args.model is not None else MINI_FOLDER)
-    return LoadedPainter(DiffusersPainter.from_mini(model), model.defaults.canvas, model.defaults.diameter)
-
-
-def _load_diffusers(args: argparse.Namespace) -> LoadedPainter:
-    for name in ("model", "controlnet"):
-        if getattr(args, name) is None:
-            raise OptionError(name, None, "a local file or folder; the backend diffusers downloads nothing")
-    _quiet_libraries()
-    from ..backends.diffusers_painter import DiffusersPainter
-
-    lora = None if args.lora is None else Path(args.lora)
-    painter = DiffusersPainter.from_files(Path(args.model), Path(args.controlnet), lora)
-    return LoadedPainter(painter, painter.defaults.canvas, painter.defaults.diameter)
-
-
-BACKENDS: Final[dict[str, Backend]] = {
-    "mini": Backend("the model this package brings along: a preview, not an estimate to rely on", _load_mini),
-    "diffusers": Backend("SDXL, a depth ControlNet and the exposure LoRA from local files", _load_diffusers),
-}
+__all__ = ["probe_metadata", "run"]
 
 _WRITERS: Final[dict[str, Callable[[Path, Probe, dict[str, str]], Path]]] = {
     ".exr": lambda path, probe, metadata: write_exr(path, probe.latlong_hdr[0], metadata=metadata),
@@ -142,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
     outputs = _Outputs.beside(args.output)
     chosen = preset(args.preset)
     evs = chosen.evs if args.evs is None else _parse_evs(args.evs)
-    backend = _choose_backend(args.backend)
+    backend = choose_backend(args.backend)
     check_merge(args.merge)
     if not 0 <= args.seed < 2**32:
         raise OptionError("seed", args.seed, "0 to 4294967295")
@@ -151,7 +85,7 @@ def run(args: argparse.Namespace) -> None:
     outputs.require_writable([Path(name) for name in (args.photo, args.depth) if name is not None])
     photo = read_photograph(args.photo)
     depth = None if args.depth is None else read_photograph(args.depth)
-    loaded = backend.load(args)
+    loaded = backend.load(ModelFiles.of(args))
     settings = Settings(
         rounds=chosen.rounds,
         evs=evs,
@@ -177,12 +111,6 @@ def _parse_evs(text: str) -> tuple[float, ...]:
         if isinstance(error, OptionError):
             raise
         raise OptionError("evs", text, "numbers and commas, such as 0,-2.5,-5") from error
-
-
-def _choose_backend(name: str) -> Backend:
-    if name not in BACKENDS:
-        raise OptionError("backend", name, ", ".join(BACKENDS))
-    return BACKENDS[name]
 
 
 def _paint(photo: Image, painter: Painter, settings: Settings, depth: Image | None) -> Probe:

@@ -1,0 +1,42 @@
+"""A painter that knows the light and makes no mistake but 8 bits: the ceiling of every accuracy table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from ..exposure import expose, quantize
+from ..geometry import latlong_to_ball
+from ..painter import Observer, PaintRequest, PaintResult, first_step
+from ..shapes import BallImage, Latlong
+
+__all__ = ["PerfectPainter"]
+
+_GUIDED: Final = 2
+"""Denoiser evaluations a step, as with classifier-free guidance."""
+
+
+@dataclass
+class PerfectPainter:
+    """Paints the true ball, whatever the seed. Its cost is that of a model doing as many steps.
+
+    Attributes:
+        latlong_hdr: (1, H, 2H, 3) the light, on the scale of the photograph's EV 0.
+    """
+
+    latlong_hdr: Latlong
+    _balls: dict[int, BallImage] = field(default_factory=dict)
+
+    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+        """See `painter.Painter`."""
+        return _GUIDED * balls * (steps - first_step(steps, strength))
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        """See `painter.Painter`."""
+        diameter = request.ball.diameter
+        if diameter not in self._balls:
+            self._balls[diameter] = latlong_to_ball(self.latlong_hdr, diameter)
+        painted = quantize(expose(self._balls[diameter], request.ev))
+        spent = self.evaluations(len(request.seeds), request.steps, request.strength)
+        observer.evaluated(spent)
+        return PaintResult(painted.expand(len(request.seeds), -1, -1, -1), spent)
