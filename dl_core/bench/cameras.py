@@ -12,9 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from jaxtyping import Float
+from torch import Tensor
+
 from ..exposure import auto_exposure, expose
 from ..geometry import camera_rotation, latlong_to_perspective, rotate_latlong
-from ..shapes import Image, Latlong
+from ..shapes import Latlong
 
 __all__ = ["CAMERAS", "Camera", "Shot", "random_camera", "take"]
 
@@ -61,7 +64,7 @@ class Shot:
         truth_hdr: (1, H, 2H, 3) linear radiance as the camera stands, on the scale of the photograph's EV 0.
     """
 
-    photo_ldr: Image
+    photo_ldr: Float[Tensor, "b rows columns c"]
     truth_hdr: Latlong
 
 

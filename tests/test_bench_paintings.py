@@ -1,0 +1,104 @@
+"""Protocols' photographs and maps: truth stands as the camera stood, runs resume, variants differ as Table 1 says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dl_core.bench.cameras import CAMERAS, Camera, random_camera, take
+from dl_core.bench.paintings import VARIANTS, Painting, Variant, paint_maps, planned
+from dl_core.bench.perfect import PerfectPainter
+from dl_core.errors import OptionError
+from dl_core.estimate import Settings
+from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_perspective
+from dl_core.imageio import read_envmap, write_exr
+from dl_core.iterative import Rounds
+from dl_core.painter import Painter
+from dl_core.presets import Preset
+
+PRESET = Preset(Rounds(balls=2, rounds=1, steps=2, final=False), (0.0, -2.5, -5.0), "short")
+SETTINGS = Settings(canvas=256, diameter=128, height=64)
+
+
+def smooth(height: int = 64) -> torch.Tensor:
+    """A map without detail, brighter than white in one direction, of another colour in each."""
+    return (0.6 + 0.5 * latlong_directions(height))[None] ** 3
+
+
+@given(st.text(min_size=1, max_size=8), st.integers(0, 5))
+def test_random_cameras_stay_within_the_papers_ranges_and_repeat(key: str, seed: int) -> None:
+    camera = random_camera(key, seed)
+    assert 30 <= camera.fov <= 150
+    assert -45 <= camera.pitch <= 45
+    assert -180 <= camera.yaw <= 180
+    assert camera == random_camera(key, seed)
+
+
+def test_a_vertical_field_of_view_of_60_degrees_is_75_wide_at_4_to_3() -> None:
+    assert Camera().longer_fov == pytest.approx(75.178, abs=1e-3)
+
+
+@pytest.mark.parametrize("camera", [Camera(), Camera(yaw=70, pitch=-30, fov=80), Camera(yaw=-150, pitch=45, fov=40)])
+def test_the_truth_stands_as_the_camera_stood(camera: Camera) -> None:
+    shot = take(smooth(), camera)
+    ahead = latlong_to_perspective(shot.truth_hdr, camera.rows, camera.columns, fov=camera.longer_fov)
+    # Turning the map interpolates it once more; it has no detail to lose but its row and column steps.
+    torch.testing.assert_close(ahead.clamp(0, 1) ** (1 / 2.4), shot.photo_ldr, atol=4e-3, rtol=0)
+
+
+def test_the_99th_percentile_of_a_photograph_is_nine_tenths() -> None:
+    assert float(take(smooth(), Camera()).photo_ldr.quantile(0.99)) == pytest.approx(0.9, abs=2e-3)
+
+
+def test_the_array_protocol_looks_around_in_ten_steps() -> None:
+    assert sorted(camera.yaw % 360 for camera in CAMERAS["array"]("x", 0)) == [36.0 * i for i in range(10)]
+
+
+@pytest.fixture
+def panorama(tmp_path: Path) -> Path:
+    return write_exr(tmp_path / "smooth.exr", smooth()[0], metadata={})
+
+
+def perfect(variant: Variant, shot: object) -> Painter:
+    return PerfectPainter(shot.truth_hdr)  # type: ignore[attr-defined]
+
+
+def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: Path) -> None:
+    out, said = tmp_path / "out", []
+    paintings = list(planned([panorama], "three-spheres", list(VARIANTS), 0))
+    paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
+    assert len(said) == len(VARIANTS)
+    truth = read_envmap(out / "truth" / f"{paintings[0].shot}.exr")
+    light = {name: read_envmap(out / "maps" / name / f"{paintings[0].shot}.exr") for name in VARIANTS}
+    for name in ("lora", "both"):
+        # Half floats and 8 bits: energy is kept within a percent.
+        torch.testing.assert_close(latlong_energy(light[name]), latlong_energy(truth), rtol=0.01, atol=0)
+    assert float(truth.max()) > 1.1
+    assert float(light["base"].max()) <= 1.0  # one exposure ends at white
+
+
+def test_what_is_there_is_not_painted_again(panorama: Path, tmp_path: Path) -> None:
+    out, said = tmp_path / "out", []
+    paintings = list(planned([panorama], "three-spheres", ["base", "both"], 0))
+    paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
+    (out / "maps" / "base" / f"{paintings[0].shot}.exr").unlink()
+    paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
+    assert len(said) == 3
+    assert "base:" in said[-1]
+
+
+def test_a_folder_of_another_run_is_refused(panorama: Path, tmp_path: Path) -> None:
+    paint_maps([], perfect, PRESET, SETTINGS, tmp_path / "out", report=lambda line: None)
+    with pytest.raises(OptionError, match="--out"):
+        paint_maps([], perfect, PRESET, replace(SETTINGS, seed=1), tmp_path / "out", report=lambda line: None)
+
+
+def test_every_photograph_of_a_run_has_its_own_name(panorama: Path) -> None:
+    shots = [painting.shot for painting in planned([panorama], "array", ["base"], 0)]
+    assert len(set(shots)) == len(shots) == 10
+    assert Painting(panorama, Camera(), "base").shot.startswith("smooth.")
