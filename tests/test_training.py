@@ -20,7 +20,7 @@ from dl_core.exposure import decode_display
 from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
 from dl_core.training.control import train_control
 from dl_core.training.decoder import train_decoder
-from dl_core.training.denoiser import draw_batch
+from dl_core.training.denoiser import BLIND_ABOVE, BLIND_FROM, draw_batch
 from dl_core.training.export import write_networks
 from dl_core.training.loop import Budget, train
 from dl_core.training.lora import train_lora
@@ -130,6 +130,23 @@ def test_a_batch_mixes_signal_and_noise_as_its_timesteps_say(panoramas: Tensor) 
     assert batch.balls[0].canvas == 128
     assert batch.weights.min() == pytest.approx(0.3)
     assert batch.weights.max() == pytest.approx(1.0)
+
+
+def test_at_the_noisiest_levels_a_ball_is_noise_alone_and_the_photograph_is_not(panoramas: Tensor) -> None:
+    # The same draws in two worlds: what differs between the batches comes from the pictures.
+    one, other = (
+        draw_batch(SceneSampler(light, 64, 32, seed=1, centred=1.0), 0, 24, full_canvas=128)
+        for light in (panoramas, panoramas.flip(-1))
+    )
+    differs = (one.noisy - other.noisy).abs().amax(dim=1)
+    on_ball, beside = differs[:, 7:9, 7:9].amax(dim=(1, 2)), differs[:, 7:9, [1, 14]].amax(dim=(1, 2))
+    blind, seeing = one.timesteps >= BLIND_ABOVE, one.timesteps <= BLIND_FROM
+    assert blind.sum() >= 3
+    assert seeing.sum() >= 3
+    assert (on_ball[blind] == 0).all()
+    assert (on_ball[seeing] > 0).all()
+    assert (beside[blind] > 0).any()
+    torch.testing.assert_close(one.timesteps, other.timesteps)
 
 
 class _Line(nn.Module):

@@ -3,6 +3,12 @@
 The mini model predicts v = sqrt(ᾱ) ε - sqrt(1 - ᾱ) z (Salimans and Ho, Progressive Distillation, ICLR 2022). Its noise
 schedule is SDXL's. Predicting ε as SDXL does leaves a small network to state overall brightness and colour as a small
 difference between its input and its output at the noisiest steps, which is where lighting is settled.
+
+Painting starts from pure noise, but SDXL's schedule ends short of it: at its last step 0.5% of the picture's power is
+left, and the mean of a ball shows through. A model trained on that reads the ball's overall colour out of the noise it
+starts from, whatever the photograph shows. So at the noisiest levels the ball's latents are noise alone here, and the
+model learns to take its light from the photograph (Lin et al., Common Diffusion Noise Schedules and Sample Steps Are
+Flawed, WACV 2024, mend the same for whole pictures by another schedule).
 """
 
 from __future__ import annotations
@@ -19,9 +25,21 @@ from ..ball import Ball, disc_mask
 from .autoencoder import block_latents
 from .scenes import BASE_CAPTIONS, SceneSampler
 
-__all__ = ["OFF_BALL_WEIGHT", "Batch", "TextBank", "draw_batch", "time_ids", "velocity_loss"]
+__all__ = [
+    "BLIND_ABOVE",
+    "BLIND_FROM",
+    "OFF_BALL_WEIGHT",
+    "Batch",
+    "TextBank",
+    "draw_batch",
+    "time_ids",
+    "velocity_loss",
+]
 
 _NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
+
+BLIND_FROM, BLIND_ABOVE = 780, 880
+"""Noise levels between which the share of balls shown as noise alone rises from 0 to 1. SDEdit starts below them."""
 
 OFF_BALL_WEIGHT = 0.3
 """Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""
@@ -91,20 +109,23 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     high_levels = torch.randint(600, 1000, (size,), generator=generator)
     levels = torch.where(torch.rand(size, generator=generator) < noisiest, high_levels, levels)
     noise = torch.randn(clean.shape, generator=generator)
+    discs = torch.cat([_disc(picture.ball, clean.shape[-1]) for picture in pictures])
+    blind = torch.rand(size, generator=generator) < (levels - BLIND_FROM) / (BLIND_ABOVE - BLIND_FROM)
+    shown = clean * (1 - discs * blind.view(-1, 1, 1, 1))
     return Batch(
-        noisy=_NOISE.add_noise(clean, noise, levels),
+        noisy=_NOISE.add_noise(shown, noise, levels),
         timesteps=levels,
         target=_NOISE.get_velocity(clean, noise, levels),
-        weights=torch.cat([_weights(picture.ball, clean.shape[-1]) for picture in pictures]),
+        weights=OFF_BALL_WEIGHT + (1 - OFF_BALL_WEIGHT) * discs,
         captions=torch.tensor([picture.caption for picture in pictures]),
         evs=torch.tensor([picture.ev for picture in pictures]),
         balls=tuple(_enlarge(picture.ball, scale) for picture in pictures),
     )
 
 
-def _weights(ball: Ball, side: int) -> Float[Tensor, "1 1 m m"]:
-    disc = torch.nn.functional.interpolate(disc_mask(ball, grow=ball.dilation)[None], size=(side, side), mode="area")
-    return OFF_BALL_WEIGHT + (1 - OFF_BALL_WEIGHT) * disc
+def _disc(ball: Ball, side: int) -> Float[Tensor, "1 1 m m"]:
+    """The inpaint disc at latent size: the share of each latent that it covers."""
+    return torch.nn.functional.interpolate(disc_mask(ball, grow=ball.dilation)[None], size=(side, side), mode="area")
 
 
 def _enlarge(ball: Ball, scale: int) -> Ball:
