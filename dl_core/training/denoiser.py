@@ -38,7 +38,7 @@ __all__ = [
 
 _NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
 
-BLIND_FROM, BLIND_ABOVE = 780, 880
+BLIND_FROM, BLIND_ABOVE = 770, 800
 """Noise levels between which the share of balls shown as noise alone rises from 0 to 1. SDEdit starts below them."""
 
 OFF_BALL_WEIGHT = 0.3
