@@ -42,7 +42,7 @@ class Settings:
     rounds: Rounds = field(default_factory=Rounds)
     evs: tuple[float, ...] = PAPER_EVS
     seed: int = 0
-    merge: str = "channel"
+    merge: str = "robust"
     canvas: int = 1024
     diameter: int = 256
     x: float | None = None

@@ -8,7 +8,9 @@ Sources: DiffusionLight, Sec. 4.2 (γ-2.4, 99th percentile to 0.9) and Algorithm
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -22,9 +24,11 @@ __all__ = [
     "GAMMA",
     "LUMINANCE",
     "MERGES",
+    "Agreement",
     "auto_exposure",
     "check_evs",
     "check_merge",
+    "compare_exposures",
     "decode_display",
     "encode_display",
     "expose",
@@ -32,6 +36,7 @@ __all__ = [
     "merge_bracket",
     "merge_channel",
     "merge_paper",
+    "merge_robust",
     "quantize",
 ]
 
@@ -39,6 +44,21 @@ GAMMA: Final = 2.4
 LUMINANCE: Final = (0.21267, 0.71516, 0.07217)
 CLIP_THRESHOLD: Final = 0.9
 """Linear value from which an exposure counts as clipped; the next darker one takes over between it and 1."""
+
+EVIDENCE_FLOOR: Final = 0.1
+"""Linear value from which a picture is compared with a darker one: below it, noise of the painter outweighs."""
+CLEAR_CODE: Final = 32 / 255
+"""Display value above which half a code of 8 bits is under 4% of the radiance, 0.05 stops."""
+EVIDENCE_COUNT: Final = 100
+"""Values that it takes to tell the error of an exposure."""
+DEAD_ZONE: Final = 0.05
+"""Stops of error that rounding may feign, and that are left alone."""
+LARGEST_ERROR: Final = 2.0
+"""Stops of error that are undone at most: two neighbours, each off by one. More is another scene."""
+TRUST: Final = 0.5
+"""Scatter in stops, a median absolute deviation, up to which a darker exposure's colour is used in full."""
+DISTRUST: Final = 1.0
+"""Scatter in stops from which it is not used at all."""
 
 
 def encode_display(radiance: Tensor, gamma: float = GAMMA) -> Tensor:
@@ -122,8 +142,109 @@ def _takeover(exposed: Tensor, brighter: Tensor, darker: Tensor) -> Tensor:
 
     It takes over only where it reports more light (Algorithm 2, line 7).
     """
-    ramp = ((exposed - CLIP_THRESHOLD) / (1 - CLIP_THRESHOLD)).clamp(0, 1)
-    return ramp * (darker > brighter).to(ramp)
+    return _ramp(exposed) * (darker > brighter).to(exposed)
+
+
+def _ramp(exposed: Tensor) -> Tensor:
+    return ((exposed - CLIP_THRESHOLD) / (1 - CLIP_THRESHOLD)).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How an exposure and the next darker one agree on what both can show.
+
+    Attributes:
+        stops: by which the darker one is brighter than its EV says; 0 without evidence.
+        trust: in its colour, 0 to 1; 1 without evidence.
+    """
+
+    stops: float = 0.0
+    trust: float = 1.0
+
+
+def compare_exposures(
+    brighter: Float[Tensor, "*n 3"], darker: Float[Tensor, "*n 3"], stops: float, gamma: float = GAMMA
+) -> Agreement:
+    """Measure an exposure against the next brighter one.
+
+    Compared are values that the brighter one shows below clipping and the darker one must show clear of its coarsest
+    codes. Their median ratio is the error of the darker one's EV. Their scatter about it says whether both are
+    pictures of one scene: it is taken over values beside a clipped channel, where the colour of a light is at stake,
+    and over all of them where those are few. An error that no exposure has, above 2 stops, counts like scatter.
+
+    Args:
+        brighter: linear values in [0, 1] of its own white.
+        darker: likewise.
+        stops: between the two, above 0, as the EVs say.
+        gamma: of the display encoding they were painted in.
+
+    Source: Mitsunaga and Nayar, Radiometric self calibration (CVPR 1999), Sec. 3.4, for exposure ratios measured from
+    the pictures; Grosch, Fast and robust high dynamic range image generation with camera and object movement (VMV
+    2006), for finding ghosts by predicting one exposure from another.
+    """
+    floor = max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
+    known = (brighter >= floor) & (brighter < CLIP_THRESHOLD)
+    beside = known & (brighter.amax(dim=-1, keepdim=True) >= CLIP_THRESHOLD)
+    ratio = torch.log2(darker.clamp(min=1e-6) / brighter.clamp(min=1e-6)) + stops
+    offset, scatter = _centre_and_scatter(ratio[known])
+    if int(beside.sum()) >= EVIDENCE_COUNT:
+        scatter = max(scatter, _centre_and_scatter(ratio[beside])[1])
+    doubt = scatter + max(0.0, abs(offset) - LARGEST_ERROR)
+    trust = min(1.0, max(0.0, (DISTRUST - doubt) / (DISTRUST - TRUST)))
+    excess = min(max(abs(offset) - scatter - DEAD_ZONE, 0.0), LARGEST_ERROR)
+    return Agreement(math.copysign(excess, offset) * trust, trust)
+
+
+def _centre_and_scatter(ratios: Float[Tensor, "n"]) -> tuple[float, float]:
+    """Median, and median absolute deviation from it; both 0 for too few values to say."""
+    if len(ratios) < EVIDENCE_COUNT:
+        return 0.0, 0.0
+    centre = ratios.median()
+    return float(centre), float((ratios - centre).abs().median())
+
+
+def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:
+    """Merge by channel as far as the exposures agree, by luminance as far as they do not.
+
+    Each darker exposure is compared with the next brighter one (`compare_exposures`): its error of exposure is undone,
+    and its colour is used to the degree that it is trusted. A trusted exposure replaces each clipped channel by its
+    own value, as `merge_channel` does. A distrusted one only says how much brighter than white a light is, and the
+    light keeps the colour of the brighter exposure, as in `merge_paper`, without its division:
+
+        channel:    l + w(l) max(0, d - l)
+        luminance:  l (1 + w(Y) max(0, D - 1))
+
+    with l and Y value and luminance of the brighter exposure in units of its white, d and D what the darker ones say
+    of them, and w rising from 0 to 1 between 0.9 and clipping. Both rise with every input, as does any mixture.
+
+    Args, Returns, Raises: as `merge_paper`; any number of EVs.
+
+    Warnings:
+        Raising a value never lowers the result at its own pixel and channel: values that tell error and trust are
+        below the threshold, where nothing is taken over. Elsewhere the result rises as well, unless what was raised
+        moves the measured error or trust of the whole exposure; on brackets that agree within 0.05 stops neither
+        moves. Errors of up to 2 stops between neighbours are undone, less 0.05 stops and the scatter.
+
+    Source: Debevec and Malik, Recovering high dynamic range radiance maps from photographs (SIGGRAPH 1997), Eq. 6, and
+    Robertson et al., Estimation-theoretic approach to dynamic range enhancement using multiple exposures (Journal of
+    Electronic Imaging 12, 2003), Sec. 4, whose weights fall to 0 at clipping and prefer the longest exposure that is
+    not clipped, which is what the ramp takes to its limit: averaging in the coarser codes of darker exposures would
+    add noise. Sen et al., Robust patch-based HDR reconstruction of dynamic scenes (SIGGRAPH Asia 2012), for one
+    reference exposure that the others may only complete where it is clipped; here EV 0.
+    """
+    balls, evs = _bracket(balls, evs)
+    linear = [decode_display(ball, gamma) for ball in balls]
+    colour, level = linear[-1], luminance(linear[-1])
+    for i in range(len(balls) - 2, -1, -1):
+        shown, stops = linear[i], evs[i] - evs[i + 1]
+        found = compare_exposures(shown, linear[i + 1], stops, gamma)
+        scale = 2.0 ** (stops - found.stops)
+        lit = luminance(shown)
+        by_channel = shown + _ramp(shown) * (colour * scale - shown).clamp(min=0)
+        by_luminance = shown * (1 + _ramp(lit) * (level * scale - 1).clamp(min=0))
+        colour = torch.lerp(by_luminance, by_channel, found.trust)
+        level = lit + _ramp(lit) * (level * scale - lit).clamp(min=0)
+    return colour
 
 
 def merge_paper(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:
@@ -177,7 +298,11 @@ def merge_channel(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = 
     return merged
 
 
-MERGES: Final[dict[str, Callable[..., Tensor]]] = {"channel": merge_channel, "paper": merge_paper}
+MERGES: Final[dict[str, Callable[..., Tensor]]] = {
+    "robust": merge_robust,
+    "channel": merge_channel,
+    "paper": merge_paper,
+}
 """Merge methods by name, the default first."""
 
 
@@ -193,7 +318,7 @@ def check_merge(method: str) -> str:
 
 
 def merge_bracket(
-    balls: Sequence[Tensor], evs: Sequence[float], method: str = "channel", gamma: float = GAMMA
+    balls: Sequence[Tensor], evs: Sequence[float], method: str = "robust", gamma: float = GAMMA
 ) -> Tensor:
     """Merge a bracket by the method of a given name (see `MERGES`).
 

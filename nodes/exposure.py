@@ -156,8 +156,8 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
                 io.Combo.Input(
                     "method",
                     options=list(MERGES),
-                    tooltip="channel: each colour by itself, so that coloured lights keep their colour. "
-                    "paper: luminance only, with the chroma of EV 0, which hides exposures that do not align.",
+                    tooltip="robust: each colour by itself as far as the exposures agree, by luminance where they do not. "
+                    "channel: each colour by itself always. paper: luminance only, with the chroma of EV 0.",
                 ),
                 io.Float.Input(
                     "gamma",

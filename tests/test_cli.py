@@ -124,7 +124,7 @@ def test_estimate_writes_a_probe_a_ball_and_a_sheet(
     assert header["lightprobe:seed"] == "7"
     assert header["lightprobe:nfe"] == str(EVALUATIONS)
     assert header["lightprobe:preset"] == "draft"
-    assert "merge channel" in header["lightprobe:method"]
+    assert "merge robust" in header["lightprobe:method"]
 
 
 def test_the_map_is_the_light_that_was_painted(backend: Callable[..., None], photo: Path, out: Path) -> None:
@@ -181,7 +181,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
         (["--evs", "0;-2"], "evs is '0;-2'; accepted: numbers and commas"),
         (["--evs", "0,nan"], "evs is"),
         (["--evs", ""], "evs is ''"),
-        (["--merge", "mean"], "merge is 'mean'; accepted: channel, paper"),
+        (["--merge", "mean"], "merge is 'mean'; accepted: robust, channel, paper"),
         (["--backend", "flux"], "backend is 'flux'; accepted: mini, diffusers"),
         (["--seed", "-1"], "seed is -1; accepted: 0 to 4294967295"),
         (["--height", "0"], "height is 0"),
@@ -319,7 +319,7 @@ def test_help_names_what_the_tables_hold(capsys: pytest.CaptureFixture[str]) -> 
     text = " ".join(capsys.readouterr().out.split())
     for name in (*PRESETS, *MERGES, *BACKENDS):
         assert name in text
-    assert next(iter(MERGES)) == "channel"
+    assert next(iter(MERGES)) == "robust"
     assert next(iter(BACKENDS)) == "mini"
 
 

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--preset", default="balanced", help="draft, balanced or paper: from fast to thorough (default: balanced)")
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
     add("--evs", metavar="0,-2.5,-5", help="exposures, descending from 0 (default: the preset's)")
-    add("--merge", default="channel", help="channel, or paper: how exposures become radiance (default: channel)")
+    add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
     add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
     add("--depth", metavar="FILE", help="depth of the photograph as a picture, near is bright (default: all far)")
     add("--diameter", type=int, help="of the ball in canvas pixels (default: the model's)")
