@@ -12,7 +12,17 @@ from tolerances import assert_close
 
 from dl_core.errors import ImageError
 from dl_core.geometry import latlong_directions
-from dl_core.metrics import angular_error, energy_kept, irradiance, si_rmse, spread_directions
+from dl_core.harmonics import sh_map
+from dl_core.metrics import (
+    angular_error,
+    dominant_light,
+    energy_kept,
+    irradiance,
+    light_direction_error,
+    sh_band_errors,
+    si_rmse,
+    spread_directions,
+)
 
 
 @pytest.mark.parametrize("count", [1, 10, 400])
@@ -106,3 +116,82 @@ def test_energy_kept_is_a_share(share: float) -> None:
 def test_a_dark_truth_is_refused(call: object) -> None:
     with pytest.raises(ImageError, match="truth"):
         call(torch.zeros(1, 8, 16, 3))  # type: ignore[operator]
+
+
+# --- the strongest light -----------------------------------------------------------------------------------------
+
+
+def lamp(direction: torch.Tensor, height: int, radius: float, radiance: float) -> torch.Tensor:
+    """A dim map with a round lamp of an angular radius in degrees."""
+    inside = latlong_directions(height) @ direction >= math.cos(math.radians(radius))
+    return (
+        torch.where(inside[..., None], torch.tensor(radiance), torch.tensor(0.2)).expand(-1, -1, 3)[None].contiguous()
+    )
+
+
+@given(seed=st.integers(0, 2**16), radius=st.floats(3, 9))
+def test_a_lamp_is_found_where_it_is(seed: int, radius: float) -> None:
+    direction = torch.randn(3, generator=torch.Generator().manual_seed(seed))
+    direction = direction / direction.norm()
+    found = dominant_light(lamp(direction, 96, radius, 50.0))[0]
+    # The lamp's edge is ragged by half a pixel of 1.9 degrees, which its centroid averages out in part. A cap whose
+    # axis lies up to half a search pixel (2 degrees) off the lamp's may cut 1 degree of a lamp of 9.
+    assert math.degrees(math.acos(min(1.0, float(found @ direction)))) < 1.0
+
+
+def test_a_lone_bright_pixel_does_not_win_over_a_lamp() -> None:
+    towards = latlong_directions(96)[30, 40]
+    latlong = lamp(towards, 96, 6.0, 20.0)
+    latlong[0, 70, 150] = 500.0  # five times fewer watts than the lamp
+    assert float(dominant_light(latlong)[0] @ towards) > math.cos(math.radians(1))
+
+
+def test_the_error_between_two_lamps_is_their_angle() -> None:
+    directions = latlong_directions(96)
+    first, second = lamp(directions[40, 60], 96, 5, 30.0), lamp(directions[40, 90], 96, 5, 30.0)
+    expected = math.degrees(math.acos(float(directions[40, 60].double() @ directions[40, 90].double())))
+    assert float(light_direction_error(first, second)) == pytest.approx(expected, abs=0.5)
+    assert float(light_direction_error(second, first)) == pytest.approx(float(light_direction_error(first, second)))
+    assert float(light_direction_error(first, first)) == 0
+
+
+def test_the_strongest_light_sees_no_scale_and_no_size() -> None:
+    truth = lamp(latlong_directions(64)[20, 30], 64, 8, 30.0)
+    assert float(light_direction_error(truth * 1024, truth)) == pytest.approx(0, abs=1e-4)
+    larger = truth.repeat_interleave(4, 1).repeat_interleave(4, 2)
+    assert float(light_direction_error(larger, truth)) < 0.2
+
+
+# --- harmonics ---------------------------------------------------------------------------------------------------
+
+
+def test_band_errors_are_zero_on_identity_and_scale_with_the_difference(generator: torch.Generator) -> None:
+    truth = torch.rand(2, 32, 64, 3, generator=generator)
+    assert_close(sh_band_errors(truth, truth), 0.0)
+    errors = sh_band_errors(truth * 1.5, truth)
+    assert_close(errors[:, 0], 0.5, dtype=torch.float32)
+    assert_close(sh_band_errors(truth * 2, truth), 2 * errors, dtype=torch.float32)
+
+
+def test_a_difference_in_one_band_shows_in_that_band_alone(generator: torch.Generator) -> None:
+    for band in range(5):
+        added = torch.zeros(1, 25, 3, dtype=torch.float64)
+        added[:, band * band : (band + 1) ** 2] = torch.randn(1, 2 * band + 1, 3, generator=generator).double()
+        truth = torch.ones(1, 128, 256, 3)
+        errors = sh_band_errors(truth + sh_map(added, 128), truth)[0]
+        wanted = torch.linalg.norm(added) / math.sqrt(3 * 4 * math.pi)
+        # Sampling a function of band 4 at 128 rows moves 5e-4 of it to other bands.
+        torch.testing.assert_close(errors[band], wanted, rtol=2e-3, atol=0)
+        assert float(errors.sum() - errors[band]) < 5e-3 * float(wanted)
+
+
+def test_band_errors_do_not_turn_with_the_world() -> None:
+    estimate, truth = torch.rand(2, 1, 32, 64, 3, generator=torch.Generator().manual_seed(6))
+    turned = [torch.roll(latlong, 17, dims=2) for latlong in (estimate, truth)]
+    torch.testing.assert_close(sh_band_errors(*turned), sh_band_errors(estimate, truth), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("measure", [sh_band_errors, light_direction_error])
+def test_dark_maps_have_no_light_to_compare_with(measure: object) -> None:
+    with pytest.raises(ImageError, match="no light"):
+        measure(torch.ones(1, 8, 16, 3), torch.zeros(1, 8, 16, 3))  # type: ignore[operator]
