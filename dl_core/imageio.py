@@ -3,6 +3,10 @@
 Every file is written under a temporary name in its own folder and then renamed: a reader sees the old file or the
 whole new one, and a run that stops leaves nothing behind.
 
+No file is trusted: what it declares is compared with its length and with limits before anything of that size is
+allocated, and whatever is damaged, truncated or not a picture of linear light becomes an `ImageError`. Nothing is
+repaired silently; channels beside R, G, B and A are left out.
+
 Sources: OpenEXR, "Standard attributes" (`chromaticities`, `envmap`); Rec. ITU-R BT.709 (primaries and white).
 """
 
@@ -11,8 +15,9 @@ from __future__ import annotations
 import secrets
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,19 +30,21 @@ from PIL import Image as PILImage
 from PIL import ImageOps
 from torch import Tensor
 
-from . import radiance
+from . import exr_header, radiance
 from .errors import ImageError, OptionError, OutputError
 from .exposure import auto_exposure, encode_display
 from .shapes import Image, Latlong
 
 __all__ = [
     "HALF_MAX",
+    "Render",
     "atomic",
     "exr_channels",
     "is_exr",
     "read_envmap",
     "read_exr_header",
     "read_photograph",
+    "read_render",
     "require_writable",
     "tone_map_preview",
     "write_exr",
@@ -58,6 +65,10 @@ KEPT_SIDE: Final = 2048
 """Pixels of the longer side that reading keeps at least: twice the canvas that photographs are fitted in."""
 ROWS_LIMIT: Final = 8192
 """Rows an environment map may declare."""
+RENDER_LIMIT: Final = 2 * ROWS_LIMIT**2
+"""Pixels a rendered picture may declare: those of the largest environment map."""
+DECODED_LIMIT: Final = 1 << 32
+"""Bytes that all channels of an EXR file may take once decoded: 4 GiB."""
 _HEADER_BYTES: Final = 1 << 16
 _NAME_LIMIT: Final = 31
 """Longest attribute name that every EXR reader takes."""
@@ -363,13 +374,52 @@ def read_envmap(path: str | Path) -> Latlong:
     """
     path = Path(path)
     if is_exr(path):
-        pixels = _read_exr(path)
-    elif _first_bytes(path, 2) == b"#?":
-        pixels = _read_radiance(path)
+        planes = _read_exr(path, _require_map)
+        pixels = np.stack([planes[name] for name in "RGB"], axis=-1)
+    elif _is_radiance(path):
+        pixels = _read_radiance(path, _require_map_size)
     else:
         raise ImageError(path, "is neither an EXR nor a Radiance (.hdr) file")
     _require_radiance(path, pixels)
     return torch.from_numpy(pixels)[None]
+
+
+@dataclass(frozen=True)
+class Render:
+    """A rendered picture of linear light.
+
+    Attributes:
+        pixels: (H, W, 3) float32, finite, 0 or above; as stored, not divided by alpha.
+        alpha: (H, W) float32; None where the file has none.
+    """
+
+    pixels: Float[Tensor, "h w 3"]
+    alpha: Float[Tensor, "h w"] | None
+
+
+def read_render(path: str | Path) -> Render:
+    """Read a rendered picture of any size: EXR or Radiance, told apart by the file's first bytes.
+
+    Args:
+        path: of the file: EXR with R, G and B in half or float, and A if there is one (channels beside these are left
+            out), or Radiance RGBE.
+
+    Raises:
+        ImageError: missing, truncated, no RGB, more than 134 million pixels, NaN, infinite or negative pixels, or NaN
+            in alpha.
+    """
+    path = Path(path)
+    if is_exr(path):
+        planes = _read_exr(path, _require_render)
+        pixels, alpha = np.stack([planes[name] for name in "RGB"], axis=-1), planes.get("A")
+    elif _is_radiance(path):
+        pixels, alpha = _read_radiance(path, _require_render_size), None
+    else:
+        raise ImageError(path, "is neither an EXR nor a Radiance (.hdr) file")
+    _require_radiance(path, pixels)
+    if alpha is not None and np.isnan(alpha).any():
+        raise ImageError(path, "holds NaN in its alpha channel")
+    return Render(torch.from_numpy(pixels), None if alpha is None else torch.from_numpy(alpha))
 
 
 def is_exr(path: str | Path) -> bool:
@@ -378,14 +428,22 @@ def is_exr(path: str | Path) -> bool:
     Raises:
         ImageError: it cannot be read.
     """
-    return _first_bytes(Path(path), 4) == b"v/1\x01"
+    return _first_bytes(Path(path), 4) == exr_header.MAGIC
+
+
+def _is_radiance(path: Path) -> bool:
+    return _first_bytes(path, 2) == b"#?"
 
 
 def _first_bytes(path: Path, count: int) -> bytes:
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ImageError(path, "is no regular file")  # reading a pipe would wait for its writer
         with path.open("rb") as file:
             return file.read(count)
-    except OSError as error:
+    except (OSError, ValueError) as error:
+        if isinstance(error, ImageError):
+            raise
         raise ImageError(path, f"cannot be read ({_reason(error)})") from error
 
 
@@ -397,18 +455,24 @@ def _require_map_size(path: Path, height: int, width: int) -> None:
         raise ImageError(path, f"declares {width} x {height} pixels; up to {ROWS_LIMIT} rows are read")
 
 
+def _require_render_size(path: Path, height: int, width: int) -> None:
+    if height < 1 or width < 1:
+        raise ImageError(path, f"is {width} x {height} pixels")
+    if height * width > RENDER_LIMIT:
+        raise ImageError(path, f"declares {width} x {height} pixels; up to {RENDER_LIMIT:,} are read")
+
+
 def read_exr_header(path: str | Path) -> dict[str, Any]:
     """The attributes of an EXR file's first part, by name, as the OpenEXR package gives them.
 
     Raises:
-        ImageError: missing, or no EXR file.
+        ImageError: missing, truncated, damaged, or no EXR file.
     """
     path = Path(path)
-    if not is_exr(path):
-        raise ImageError(path, "is no EXR file")
+    _exr_parts(path)
     try:
         return dict(OpenEXR.File(str(path), header_only=True).header())
-    except (RuntimeError, ValueError) as error:
+    except _EXR_FAULTS as error:
         raise ImageError(path, f"is a damaged EXR file ({error})") from error
 
 
@@ -418,49 +482,80 @@ def exr_channels(path: str | Path) -> dict[str, str]:
     Raises:
         ImageError: missing, damaged, or no EXR file.
     """
-    names = {"float16": "half", "float32": "float", "uint32": "uint"}
-    return {name: names[str(plane.dtype)] for name, plane in _exr_planes(Path(path)).items()}
+    return {channel.name: channel.kind for channel in _exr_parts(Path(path))[0].channels}
+
+
+_EXR_FAULTS: Final = (RuntimeError, ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError)
+"""What the OpenEXR package raises on damaged files."""
+
+
+def _exr_parts(path: Path) -> tuple[exr_header.Part, ...]:
+    """What a file declares, checked against its length and against what will be decoded."""
+    if not is_exr(path):
+        raise ImageError(path, "is no EXR file")
+    try:
+        with path.open("rb") as file:
+            parts = exr_header.parse_parts(file)
+    except exr_header.ExrFormatError as error:
+        raise ImageError(path, str(error)) from error
+    except OSError as error:
+        raise ImageError(path, f"cannot be read ({_reason(error)})") from error
+    return parts
+
+
+def _read_exr(path: Path, require: Callable[[Path, exr_header.Part], None]) -> dict[str, NDArray[np.float32]]:
+    """The planes R, G, B and, if there is one, A of a file's first part, once its header is found acceptable."""
+    parts = _exr_parts(path)
+    require(path, parts[0])
+    _require_colour(path, parts[0])
+    decoded = sum(part.decoded_bytes for part in parts)
+    if decoded > DECODED_LIMIT:
+        raise ImageError(
+            path, f"declares {decoded:,} bytes of pixels in all channels; up to {DECODED_LIMIT:,} are read"
+        )
+    planes = _exr_planes(path)
+    if not planes.keys() >= set("RGB"):
+        raise ImageError(path, "is a damaged EXR file (channels that its header lists are missing)")
+    return {name: planes[name].astype(np.float32) for name in "RGBA" if name in planes}
 
 
 def _exr_planes(path: Path) -> dict[str, NDArray[Any]]:
     try:
         channels = OpenEXR.File(str(path), separate_channels=True).channels()
         return {name: channel.pixels for name, channel in channels.items()}
-    except (RuntimeError, ValueError) as error:
+    except _EXR_FAULTS as error:
         raise ImageError(path, f"is a damaged or truncated EXR file ({error})") from error
 
 
-def _read_exr(path: Path) -> NDArray[np.float32]:
-    _check_exr_header(path, read_exr_header(path))
-    planes = _exr_planes(path)
-    kinds = sorted({str(planes[name].dtype) for name in "RGB"})
-    if not {"float16", "float32"} >= set(kinds):
-        raise ImageError(path, f"holds {', '.join(kinds)} pixels; half or float are accepted")
-    return np.stack([planes[name] for name in "RGB"], axis=-1).astype(np.float32)
-
-
-def _check_exr_header(path: Path, header: dict[str, Any]) -> None:
-    low, high = header["dataWindow"]
-    width, height = (int(end) - int(start) + 1 for start, end in zip(low, high, strict=True))
-    _require_map_size(path, height, width)
-    if header["type"] not in (OpenEXR.scanlineimage, OpenEXR.tiledimage):
-        raise ImageError(path, "is a deep image; a flat one is accepted")
-    if header.get("envmap", OpenEXR.ENVMAP_LATLONG) != OpenEXR.ENVMAP_LATLONG:
+def _require_map(path: Path, part: exr_header.Part) -> None:
+    _require_map_size(path, part.height, part.width)
+    if part.cube:
         raise ImageError(path, "is a cube map; a latlong map is accepted")
-    channels = {channel.name: channel for channel in header["channels"]}
+
+
+def _require_render(path: Path, part: exr_header.Part) -> None:
+    _require_render_size(path, part.height, part.width)
+
+
+def _require_colour(path: Path, part: exr_header.Part) -> None:
+    """Reject what holds no full planes of R, G and B."""
+    if part.deep:
+        raise ImageError(path, "is a deep image; a flat one is accepted")
+    channels = {channel.name: channel for channel in part.channels}
     if not channels.keys() >= set("RGB"):
         raise ImageError(path, f"has the channels {', '.join(sorted(channels))}; R, G and B are needed")
-    for name in "RGB":
-        channel = channels[name]
-        if channel.xSampling != 1 or channel.ySampling != 1:
-            raise ImageError(path, f"has a subsampled channel {name}; full resolution is accepted")
+    used = [channels[name] for name in "RGBA" if name in channels]
+    if any(channel.kind == "uint" for channel in used):
+        raise ImageError(path, "holds uint32 pixels; half or float are accepted")
+    if any(channel.sampling != (1, 1) for channel in used):
+        raise ImageError(path, "has subsampled channels; full resolution is accepted")
 
 
-def _read_radiance(path: Path) -> NDArray[np.float32]:
+def _read_radiance(path: Path, require_size: Callable[[Path, int, int], None]) -> NDArray[np.float32]:
     try:
         header = radiance.parse_header(_first_bytes(path, _HEADER_BYTES))
-        _require_map_size(path, header.height, header.width)
-        pixels = radiance.decode_pixels(path.read_bytes(), header)
+        require_size(path, header.height, header.width)
+        pixels = radiance.decode_pixels(_first_bytes(path, radiance.longest_file(header)), header)
     except radiance.RadianceFormatError as error:
         raise ImageError(path, str(error)) from error
     return radiance.decode_rgbe(pixels) / np.float32(header.exposure)

@@ -17,7 +17,7 @@ from typing import Final
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .errors import ImageError
@@ -43,8 +43,10 @@ LIGHT_RADIUS: Final = 10.0
 """Angular radius, in degrees, of the caps that compete for the strongest light."""
 LIGHT_EDGE: Final = 1 / 3
 """Share of a light's peak down to which pixels belong to it (Gardner et al. 2019, Sec. 3)."""
-_SEARCH_ROWS: Final = 64
+_SEARCH_ROWS: Final = 32
 """Rows that a map is reduced to for the search; the direction itself is measured on the full map."""
+_RECENTRINGS: Final = 3
+"""Times the winning cap is moved to the centroid of its light, so that a light is not cut by the search's grid."""
 
 
 def spread_directions(count: int) -> Float[Tensor, "n 3"]:
@@ -159,13 +161,25 @@ def dominant_light(latlong_hdr: Latlong) -> Float[Tensor, "b 3"]:
 def _dominant_light(intensity: Float[Tensor, "h w"]) -> Float[Tensor, "3"]:
     if not bool((intensity > 0).any()):
         raise ImageError("latlong", "holds no light")
-    height = intensity.shape[0]
-    directions = latlong_directions(height, device=intensity.device).double()
-    energy = intensity * latlong_solid_angles(height, device=intensity.device)
-    cap = directions @ _brightest_cap(intensity) >= math.cos(math.radians(LIGHT_RADIUS))
-    region = cap & (intensity >= LIGHT_EDGE * intensity[cap].max())
-    centroid = (energy[region][:, None] * directions[region]).sum(0)
-    return centroid / torch.linalg.norm(centroid)
+    directions = latlong_directions(intensity.shape[0], device=intensity.device).double()
+    energy = intensity * latlong_solid_angles(intensity.shape[0], device=intensity.device)
+    axis = _brightest_cap(intensity)
+    for _ in range(_RECENTRINGS):
+        axis = _centroid(energy, directions, _cap(directions, axis))
+    cap = _cap(directions, axis)
+    return _centroid(energy, directions, cap & (intensity >= LIGHT_EDGE * intensity[cap].max()))
+
+
+def _cap(directions: Float[Tensor, "*n 3"], axis: Float[Tensor, "3"]) -> Bool[Tensor, "*n"]:
+    """Which directions lie in the cap about an axis; the nearest one at least."""
+    cosines = directions @ axis
+    return cosines >= min(math.cos(math.radians(LIGHT_RADIUS)), float(cosines.max()))
+
+
+def _centroid(
+    energy: Float[Tensor, "h w"], directions: Float[Tensor, "h w 3"], region: Bool[Tensor, "h w"]
+) -> Float[Tensor, "3"]:
+    return F.normalize((energy[region][:, None] * directions[region]).sum(0), dim=0)
 
 
 def _brightest_cap(intensity: Float[Tensor, "h w"]) -> Float[Tensor, "3"]:
@@ -174,12 +188,11 @@ def _brightest_cap(intensity: Float[Tensor, "h w"]) -> Float[Tensor, "3"]:
     reduced = F.adaptive_avg_pool2d(intensity[None], (height, 2 * height))[0]
     directions = latlong_directions(height, device=intensity.device).double().reshape(-1, 3)
     energy = (reduced * latlong_solid_angles(height, device=intensity.device)).flatten()
-    edge = math.cos(math.radians(LIGHT_RADIUS))
-    held = [(axes @ directions.T >= edge).double() @ energy for axes in directions.split(1024)]
-    return directions[int(torch.cat(held).argmax())]
+    within = directions @ directions.T >= math.cos(math.radians(LIGHT_RADIUS))
+    return directions[int((within.double() @ energy).argmax())]
 
 
-def light_direction_error(estimate_hdr: Latlong, truth_hdr: Latlong) -> Float[Tensor, "b"]:
+def light_direction_error(estimate_hdr: Latlong, truth_hdr: Float[Tensor, "b rows columns c"]) -> Float[Tensor, "b"]:
     """Angle in degrees between the strongest lights of two maps, which may differ in size.
 
     Raises:
@@ -190,7 +203,9 @@ def light_direction_error(estimate_hdr: Latlong, truth_hdr: Latlong) -> Float[Te
     return torch.rad2deg(rgb_angles(dominant_light(estimate_hdr), dominant_light(truth_hdr)))
 
 
-def sh_band_errors(estimate_hdr: Latlong, truth_hdr: Latlong, band: int = 4) -> Float[Tensor, "b l"]:
+def sh_band_errors(
+    estimate_hdr: Latlong, truth_hdr: Float[Tensor, "b rows columns c"], band: int = 4
+) -> Float[Tensor, "b l"]:
     """Difference of two maps in each band of spherical harmonics, relative to the truth's band 0.
 
     The norm goes over a band's orders and the channels, ‖e_l - t_l‖ / ‖t_0‖, and does not change when both maps are

@@ -21,12 +21,14 @@ __all__ = [
     "decode_rgbe",
     "encode_picture",
     "encode_rgbe",
+    "longest_file",
     "parse_header",
 ]
 
 _SHORTEST_RUN: Final = 4
 _LONGEST_RUN: Final = 127
 _LONGEST_LITERAL: Final = 128
+_LEAST_EXPOSURE: Final = 1e-30
 _ENCODED_WIDTHS: Final = range(8, 32768)
 """Widths that run-length encoded scanlines can state; others are stored flat."""
 
@@ -132,11 +134,26 @@ def parse_header(data: bytes) -> PictureHeader:
     size = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})", resolution)
     if size is None:
         raise RadianceFormatError(f"has the resolution line {resolution!r}; '-Y height +X width' is accepted")
-    exposures = re.findall(rb"^EXPOSURE=\s*([0-9.eE+-]+)\s*$", text, flags=re.MULTILINE)
-    exposure = float(np.prod([float(value) for value in exposures]))
-    if not 0 < exposure < np.inf:
-        raise RadianceFormatError(f"states an exposure of {exposure:g}")
+    exposure = _exposure(text)
     return PictureHeader(int(size[1]), int(size[2]), exposure, len(text) + len(blank) + len(resolution) + 1)
+
+
+def _exposure(text: bytes) -> float:
+    """Product of the EXPOSURE lines; radiance divided by it has to stay within float32."""
+    exposure = 1.0
+    for stated in re.findall(rb"^EXPOSURE=(.*)$", text, flags=re.MULTILINE):
+        try:
+            exposure *= float(stated)
+        except ValueError as error:
+            raise RadianceFormatError(f"states an exposure of {stated.decode('latin-1')!r}, no number") from error
+    if not _LEAST_EXPOSURE <= exposure <= 1 / _LEAST_EXPOSURE:
+        raise RadianceFormatError(f"states an exposure of {exposure:g}; 1e-30 to 1e30 is accepted")
+    return exposure
+
+
+def longest_file(header: PictureHeader) -> int:
+    """Bytes up to the end of a picture at the most: each byte of each component on its own costs two."""
+    return header.start + header.height * (4 + 8 * header.width)
 
 
 def decode_pixels(data: bytes, header: PictureHeader) -> NDArray[np.uint8]:
@@ -161,6 +178,9 @@ def _flat_pixels(data: bytes, header: PictureHeader) -> NDArray[np.uint8]:
 
 
 def _decode_scanlines(data: bytes, header: PictureHeader) -> NDArray[np.uint8]:
+    shortest = 4 + 8 * -(-header.width // _LONGEST_RUN)
+    if len(data) - header.start < header.height * shortest:
+        raise RadianceFormatError(f"ends early or holds a broken run: a row takes {shortest} bytes or more")
     pixels = np.empty((header.height, 4, header.width), np.uint8)
     at, prefix = header.start, bytes((2, 2, header.width >> 8, header.width & 255))
     for row in range(header.height):

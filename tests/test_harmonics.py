@@ -61,8 +61,8 @@ def test_the_basis_is_scipys(generator: torch.Generator) -> None:
 def test_the_first_four_are_the_ones_everyone_prints() -> None:
     right, up, back = torch.eye(3)
     band_0, band_1 = 0.5 * math.sqrt(1 / math.pi), math.sqrt(3 / (4 * math.pi))
-    expected = torch.tensor([[band_0, band_1, 0, 0], [band_0, 0, band_1, 0], [band_0, 0, 0, band_1]])
-    assert_close(sh_basis(torch.stack((right, up, back)), 1), expected)
+    rows = [[band_0, band_1, 0, 0], [band_0, 0, band_1, 0], [band_0, 0, 0, band_1]]
+    assert_close(sh_basis(torch.stack((right, up, back)), 1), torch.tensor(rows, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("height", [1, 5, 32, 128])
