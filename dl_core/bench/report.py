@@ -13,7 +13,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -58,6 +58,7 @@ class Report:
         seconds: of wall time.
         seeds: of whatever was random.
         evaluations: of a denoiser.
+        headline: figures that the document has on its top level too, for a bench that measures one thing.
     """
 
     bench: str
@@ -67,6 +68,7 @@ class Report:
     seconds: float
     seeds: tuple[int, ...] = ()
     evaluations: int = 0
+    headline: Row = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,7 @@ def document(report: Report, args: argparse.Namespace) -> Row:
     kept = (bool, int, float, str, list, tuple)
     options = {key: value for key, value in vars(args).items() if key not in hidden and isinstance(value, kept)}
     return {
+        **report.headline,
         "bench": report.bench,
         "protocol": report.protocol,
         "options": options,
