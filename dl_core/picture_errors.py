@@ -10,7 +10,7 @@ different conventions cannot be compared; every report names the one it used.
   one scene are the same.
 - `published-array`: as the same authors count their array of spheres: means over pixels and channels, and pixels that
   have no angle left out.
-- `radiance`: linear maps at their own size, means over pixels and channels, black pixels left out of the angle, and
+- `radiance`: linear maps, means over pixels and channels, black pixels left out of the angle, and
   the range of the normalized RMSE taken on the mask.
 
 Sources: Grosse et al., Ground truth dataset and baseline evaluations for intrinsic image algorithms (ICCV 2009), Sec.

@@ -34,6 +34,7 @@ BENCHES: Final[dict[str, Bench]] = {
     "merge": Bench("what unwrap and merge lose behind a perfect painter", ".merge"),
     "geometry": Bench("what latlong -> ball -> latlong loses", ".geometry"),
     "metrics": Bench("score a picture against the true one", ".pairs"),
+    "protocol": Bench("score given maps by the paper's protocols", ".protocol"),
 }
 """The benches by name; a new one is a new row."""
 

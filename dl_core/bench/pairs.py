@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -27,11 +28,11 @@ ERROR_COLUMNS: Final = (
 )
 
 
-def add_convention(parser: argparse.ArgumentParser) -> None:
-    """Declare `--convention`."""
-    lines = "; ".join(f"{name}: {convention.summary}" for name, convention in CONVENTIONS.items())
+def add_convention(parser: argparse.ArgumentParser, names: Sequence[str] = tuple(CONVENTIONS)) -> None:
+    """Declare `--convention`, with those conventions that apply."""
+    lines = "; ".join(f"{name}: {CONVENTIONS[name].summary}" for name in names)
     parser.add_argument(
-        "--convention", choices=tuple(CONVENTIONS), default="radiance", help=f"how errors are counted ({lines})"
+        "--convention", choices=tuple(names), default="radiance", help=f"how errors are counted ({lines})"
     )
 
 
