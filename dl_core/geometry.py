@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +29,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .errors import OptionError
-from .shapes import BallImage, Directions, Disc, Image, Latlong
+from .footprints import Footprints, coverage, spherical, unwrap
+from .projection import ORTHOGRAPHIC, Projection, disc_coordinates, disc_directions
+from .shapes import BallImage, Directions, Image, Latlong, Mask
 
 __all__ = [
     "ball_coverage",
@@ -41,6 +42,7 @@ __all__ = [
     "disc_coordinates",
     "disc_directions",
     "latlong_coordinates",
+    "latlong_coverage",
     "latlong_directions",
     "latlong_energy",
     "latlong_solid_angles",
@@ -79,14 +81,6 @@ def _subpixels(count: int, samples: int, device: torch.device | None = None) -> 
 # --- latlong -----------------------------------------------------------------------------------------------------
 
 
-def _spherical(u: Tensor, v: Tensor) -> Directions:
-    """Unit vectors for map coordinates u (across) and v (down), both in [0, 1]."""
-    azimuth = (u - 0.5) * (2 * math.pi)
-    polar = v * math.pi
-    sin_polar = torch.sin(polar)
-    return torch.stack((sin_polar * torch.sin(azimuth), torch.cos(polar), -sin_polar * torch.cos(azimuth)), dim=-1)
-
-
 def latlong_directions(height: int, *, device: torch.device | None = None) -> Float[Tensor, "h w 3"]:
     """Directions of the pixel centres of a latlong map.
 
@@ -103,7 +97,7 @@ def latlong_directions(height: int, *, device: torch.device | None = None) -> Fl
     _require_height(height)
     v = _subpixels(height, 1, device) / height
     u = _subpixels(2 * height, 1, device) / (2 * height)
-    return _spherical(u[None, :].expand(height, -1), v[:, None].expand(-1, 2 * height))
+    return spherical(u[None, :].expand(height, -1), v[:, None].expand(-1, 2 * height))
 
 
 def latlong_coordinates(directions: Directions) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
@@ -191,7 +185,7 @@ def _gather_latlong(look_up: Callable[[Tensor], Tensor], height: int, samples: i
     u = _subpixels(2 * height, samples, device) / (2 * height)
     strips = []
     for strip in v.split(rows_per_strip * samples):
-        directions = _spherical(u[None, :].expand(len(strip), -1), strip[:, None].expand(-1, len(u)))
+        directions = spherical(u[None, :].expand(len(strip), -1), strip[:, None].expand(-1, len(u)))
         values = look_up(directions)
         weights = torch.sin(strip * math.pi).view(1, -1, samples, 1, 1, 1).to(values)
         blocks = values.reshape(values.shape[0], len(strip) // samples, samples, 2 * height, samples, values.shape[-1])
@@ -201,35 +195,6 @@ def _gather_latlong(look_up: Callable[[Tensor], Tensor], height: int, samples: i
 
 
 # --- mirror ball -------------------------------------------------------------------------------------------------
-
-
-def disc_directions(disc: Disc) -> Directions:
-    """Directions reflected to an orthographic viewer at +Z by the points of a unit mirror ball's disc.
-
-    Args:
-        disc: (..., 2), x right and y up, with x² + y² <= 1; points outside reflect as the rim does.
-    """
-    x, y = disc.unbind(-1)
-    squared = (x * x + y * y).clamp(max=1)
-    twice_normal_z = 2 * torch.sqrt(1 - squared)
-    return torch.stack((twice_normal_z * x, twice_normal_z * y, 1 - 2 * squared), dim=-1)
-
-
-def disc_coordinates(directions: Directions) -> Disc:
-    """Where on the unit disc a direction is reflected: the inverse of `disc_directions`.
-
-    Straight ahead (0, 0, -1) is the whole rim; it gets the rim's rightmost point.
-
-    Args:
-        directions: (..., 3) unit vectors.
-    """
-    x, y, z = directions.unbind(-1)
-    transverse = torch.hypot(x, y)
-    # sqrt((1 - z) / 2) loses its digits near the centre, transverse / sqrt(2 + 2z) near the rim.
-    radius = torch.where(z > 0, transverse / torch.sqrt(2 + 2 * z.clamp(min=0)), torch.sqrt((1 - z).clamp(min=0) / 2))
-    on_axis = transverse == 0
-    scale = radius / torch.where(on_axis, torch.ones_like(transverse), transverse)
-    return torch.stack((torch.where(on_axis, radius, scale * x), scale * y), dim=-1)
 
 
 def ball_solid_angle(radius: float) -> float:
@@ -261,9 +226,8 @@ def ball_coverage(
     The energy of a ball image is the sum of radiance x coverage x `ball_solid_angle(radius)`.
     """
     _require_samples(samples)
-    positions = _subpixels(size, samples, device)
-    disc = _crop_disc(positions, positions, size / 2 if radius is None else radius, (size / 2, size / 2))
-    return (disc.square().sum(-1) <= 1).float().reshape(size, samples, size, samples).mean(dim=(1, 3))
+    radius, centre = _placed(size, radius, None)
+    return coverage(size, radius, centre, ORTHOGRAPHIC.lens(radius, centre, size), samples).to(device)
 
 
 def _crop_disc(columns: Tensor, rows: Tensor, radius: float, centre: tuple[float, float]) -> Float[Tensor, "r c 2"]:
@@ -356,10 +320,11 @@ def ball_to_latlong(
     *,
     radius: float | None = None,
     centre: tuple[float, float] | None = None,
-    samples: int = 4,
+    projection: Projection = ORTHOGRAPHIC,
+    samples: int = 1,
     painted: bool = False,
 ) -> Latlong:
-    """Unwrap an orthographic mirror ball to a latlong map.
+    """Unwrap a mirror ball to a latlong map, each pixel of the map averaged over its footprint on the ball.
 
     Args:
         ball: (B, D, D, C), linear or display-encoded: values are interpolated as they are.
@@ -367,13 +332,15 @@ def ball_to_latlong(
         radius: of the ball in pixels; D / 2 when not given. Half a pixel too much or too little moves a light that
             stands 20 degrees from straight ahead by 2.8 degrees (for D = 256).
         centre: (x, y) of the ball in the crop, in pixels from its top-left corner; the middle when not given.
-        samples: samples along each side of a pixel of the map.
+        projection: of the camera; directions it cannot see get the values of the outline (see `latlong_coverage`).
+        samples: samples to a ball pixel's side, at least one to a pixel of the map. More cost time and gain nothing
+            measurable (`lightprobe bench geometry`).
         painted: leave out the rim's pixels whose centre is off the ball. A picture shows background there, which no
             exposure darkens, so that a merge would take it for a lamp. Of a rendered ball (`latlong_to_ball`) those
             pixels hold only the ball; leaving them out costs up to 0.6% of the energy of a scene bright ahead.
 
     Returns:
-        (B, height, 2 height, C).
+        (B, height, 2 height, C). Differentiable in the ball.
 
     Raises:
         OptionError: a crop that is not square, a height below 1, a radius not above 0, or samples outside 1 to 64.
@@ -382,50 +349,45 @@ def ball_to_latlong(
     """
     if ball.ndim != 4 or ball.shape[1] != ball.shape[2]:
         raise OptionError("ball", tuple(ball.shape), "shape (batch, side, side, channels)")
+    _require_height(height)
+    _require_samples(samples)
     size = ball.shape[1]
-    radius = size / 2 if radius is None else radius
-    centre = (size / 2, size / 2) if centre is None else centre
-    weights = _rim_weights(size, float(radius), (float(centre[0]), float(centre[1]))).to(ball)
-    if painted:
-        positions = _subpixels(size, 1, ball.device)
-        weights = weights * (_crop_disc(positions, positions, radius, centre).square().sum(-1) <= 1)
-    weights = weights[None, :, :, None]
-    # Multiplied by 0, what is left out could still be NaN.
-    ball = torch.where(weights > 0, ball, torch.zeros_like(ball))
-    weighted = torch.cat((ball * weights, weights.expand(ball.shape[0], -1, -1, -1)), dim=-1)
-
-    def reflect(directions: Tensor) -> Tensor:
-        disc = disc_coordinates(directions)
-        values = _bilinear(weighted, centre[0] + radius * disc[..., 0], centre[1] - radius * disc[..., 1])
-        return values[..., :-1] / values[..., -1:].clamp(min=1e-6)
-
-    return _gather_latlong(reflect, height, samples, ball.device)
+    radius, centre = _placed(size, radius, centre)
+    return unwrap(ball, Footprints(height, size, radius, centre, projection, samples, painted))
 
 
-@lru_cache(maxsize=16)
-@torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
-def _rim_weights(size: int, radius: float, centre: tuple[float, float], sweeps: int = 6) -> Float[Tensor, "d d"]:
-    """Pixel weights with which normalized bilinear sampling of a ball keeps its energy; 1 away from the rim.
+def latlong_coverage(
+    height: int,
+    size: int,
+    *,
+    radius: float | None = None,
+    centre: tuple[float, float] | None = None,
+    projection: Projection = ORTHOGRAPHIC,
+    device: torch.device | None = None,
+) -> Mask:
+    """Directions of a map that a ball really shows: (1, height, 2 height), 1 where seen and 0 elsewhere.
 
-    Beside the rim a bilinear sample reaches past the ball. Leaving those pixels out and normalizing what remains
-    gives some pixels more of the sphere than the ball covers of them, others less: 1% of the energy for a scene that
-    is bright straight ahead. The weights are scaled until each pixel's share is the area the ball covers of it
-    (Sinkhorn's iteration). Six sweeps bring every share within 2%, and all errors together to 0.02% of a 256-pixel
-    ball, 0.1% of a 64-pixel one.
+    Not seen are the cone behind a ball in perspective, what lies off the crop, and what is reflected by the outer
+    half pixel of the ball, where a picture mixes it with its background.
+
+    Args: as `ball_to_latlong`.
     """
-    samples = 4 if size <= 512 else 2
-    positions = _subpixels(size, samples)
-    on_ball = (_crop_disc(positions, positions, radius, centre).square().sum(-1) <= 1).float()[None, None]
-    coverage = F.avg_pool2d(on_ball, samples)
-    tent = 1 - ((torch.arange(2 * samples) + 0.5) / samples - 1).abs()
-    kernel = (tent[:, None] * tent[None, :])[None, None]
-    weights = coverage
-    for _ in range(sweeps):
-        total = F.conv_transpose2d(weights, kernel, stride=samples, padding=samples // 2)
-        one_each = torch.where(total > 0, on_ball / total.clamp(min=1e-12), torch.zeros_like(total)) / samples**2
-        share = weights * F.conv2d(one_each, kernel, stride=samples, padding=samples // 2)
-        weights = torch.where(share > 0, weights * coverage / share.clamp(min=1e-12), weights)
-    return weights[0, 0]
+    radius, centre = _placed(size, radius, centre)
+    lens = projection.lens(radius, centre, size)
+    directions = latlong_directions(height, device=device)
+    disc = lens.locate(directions)
+    x, y = centre[0] + radius * disc[..., 0], centre[1] - radius * disc[..., 1]
+    inside = lens.on_ball(disc * (1 + 0.5 / radius)) & lens.sees(directions)
+    on_crop = (x >= 0) & (x <= size) & (y >= 0) & (y <= size)
+    return (inside & on_crop).float()[None]
+
+
+def _placed(size: int, radius: float | None, centre: tuple[float, float] | None) -> tuple[float, tuple[float, float]]:
+    """Radius and centre of a ball in its crop, with what was not given filled in."""
+    radius = size / 2 if radius is None else radius
+    _require_radius(radius)
+    centre = (size / 2, size / 2) if centre is None else centre
+    return float(radius), (float(centre[0]), float(centre[1]))
 
 
 # --- camera ------------------------------------------------------------------------------------------------------
