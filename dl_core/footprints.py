@@ -123,7 +123,7 @@ def unwrap(ball: BallImage, key: Footprints) -> Latlong:
 @torch.no_grad()
 def _matrix(key: Footprints, device: torch.device) -> tuple[tuple[_Rows, ...], Tensor]:
     """The matrix of a whole map in strips of rows, and which ball pixels (size, size) it reads."""
-    rows = max(1, STRIP_PIXELS // (2 * key.height))
+    rows = max(1, STRIP_PIXELS // (2 * key.height * key.samples**2))
     raw = [_strip(key, first, min(rows, key.height - first)) for first in range(0, key.height, rows)]
     weights = _pixel_weights(key, raw)
     strips = []
@@ -189,7 +189,7 @@ def _sweep(
 
 
 def coverage(
-    size: int, radius: float, centre: tuple[float, float], lens: Lens, samples: int = 16
+    size: int, radius: float, centre: tuple[float, float], lens: Lens, samples: int = 64
 ) -> Float[Tensor, "d d"]:
     """How much of each pixel of a crop the ball covers, 0 to 1: exact inside and outside, sampled on the outline."""
 

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .errors import OptionError
 from .footprints import Footprints, coverage, spherical, unwrap
-from .projection import ORTHOGRAPHIC, Projection, disc_coordinates, disc_directions
+from .projection import ORTHOGRAPHIC, Lens, Projection, disc_coordinates, disc_directions
 from .shapes import BallImage, Directions, Image, Latlong, Mask
 
 __all__ = [
@@ -219,7 +219,7 @@ def ball_directions(
 
 
 def ball_coverage(
-    size: int, *, radius: float | None = None, samples: int = 8, device: torch.device | None = None
+    size: int, *, radius: float | None = None, samples: int = 64, device: torch.device | None = None
 ) -> Float[Tensor, "d d"]:
     """How much of each pixel of a square crop the ball covers, 0 to 1.
 
@@ -248,17 +248,25 @@ def _ball_samples(height: int, radius: float) -> int:
 
 
 def latlong_to_ball(
-    latlong: Latlong, size: int, *, radius: float | None = None, samples: int | None = None
+    latlong: Latlong,
+    size: int,
+    *,
+    radius: float | None = None,
+    centre: tuple[float, float] | None = None,
+    projection: Projection = ORTHOGRAPHIC,
+    samples: int | None = None,
 ) -> BallImage:
-    """The mirror ball that an orthographic viewer sees in the light of a map.
+    """The mirror ball that a camera sees in the light of a map.
 
     Args:
         latlong: (B, H, 2H, C), normally linear radiance.
-        size: side of the square crop in pixels; the ball is centred in it.
+        size: side of the square crop in pixels.
         radius: of the ball in pixels; half the crop when not given.
+        centre: (x, y) of the ball in the crop, in pixels from its top-left corner; the middle when not given.
+        projection: of the camera.
         samples: samples along each side of a pixel at the centre, up to four times as many near the rim; when not
-            given, as many as keep the energy of a light one map pixel wide within 0.3%, except within 5 degrees of
-            straight ahead (3%). Those of a rim pixel that miss the ball do not count.
+            given, as many as keep the energy of a light one map pixel wide within 0.3%. Those of a rim pixel that
+            miss the ball do not count.
 
     Returns:
         (B, size, size, C); zero outside the ball.
@@ -269,18 +277,21 @@ def latlong_to_ball(
     Source: DiffusionLight, Sec. 4.2 (training pairs: a chrome ball rendered from a panorama).
     """
     _require_latlong(latlong)
-    radius = size / 2 if radius is None else radius
-    _require_radius(radius)
+    radius, centre = _placed(size, radius, centre)
     samples = _ball_samples(latlong.shape[1], radius) if samples is None else samples
     _require_samples(samples)
-    x, y = torch.meshgrid(*[torch.arange(size, device=latlong.device) - size / 2] * 2, indexing="xy")
-    corners = torch.stack((x, -y), dim=-1).reshape(-1, 2)
+    lens = projection.lens(radius, centre, size)
+    x, y = torch.meshgrid(*[torch.arange(size, device=latlong.device, dtype=torch.float32)] * 2, indexing="xy")
+    corners = torch.stack((x - centre[0], centre[1] - y), dim=-1).reshape(-1, 2)
     length = torch.linalg.norm(corners + corners.new_tensor([0.5, -0.5]), dim=-1) / radius
-    ball = latlong.new_zeros(latlong.shape[0], size * size, latlong.shape[3])
+    # The last channel counts samples.
+    total = latlong.new_zeros(latlong.shape[0], size * size, latlong.shape[3] + 1)
     for inner, outer, detail in _RINGS:
         ring = torch.nonzero((length >= inner) & (length < outer)).squeeze(1)
-        ball[:, ring] = _average_ball_pixels(latlong, corners[ring], radius, min(64, round(detail * samples)))
-    return ball.unflatten(1, (size, size))
+        total[:, ring] = _sum_ball_pixels(latlong, corners[ring], radius, lens, min(64, round(detail * samples)))
+    if lens.equal_area:
+        _add_rim(total, latlong, radius, centre)
+    return (total[..., :-1] / total[..., -1:].clamp(min=1e-9)).unflatten(1, (size, size))
 
 
 _RINGS = ((0.0, 0.7, 1.0), (0.7, 0.92, 1.5), (0.92, 0.985, 2.5), (0.985, math.inf, 4.0))
@@ -290,16 +301,23 @@ A radial step dr turns the reflection by 2 dr / sqrt(1 - r²): 1.4 times as far 
 5.8 at 0.985.
 """
 
+_RIM = math.radians(20)
+"""Angle from straight ahead within which an orthographic ball is sampled by direction.
 
-def _average_ball_pixels(
-    latlong: Latlong, corners: Float[Tensor, "n 2"], radius: float, samples: int
-) -> Float[Tensor, "b n c"]:
-    """Mean radiance over the part on the ball of each of n pixels; 0 for a pixel off the ball.
+There the ball's pixels are wedges of up to 14 degrees, and no even grid in a pixel finds a sun one degree wide.
+"""
+
+
+def _sum_ball_pixels(
+    latlong: Latlong, corners: Float[Tensor, "n 2"], radius: float, lens: Lens, samples: int
+) -> Float[Tensor, "b n k"]:
+    """Radiance summed over the part on the ball of each of n pixels, and the area of that part, in pixels.
 
     Args:
         latlong: the light.
         corners: upper left corners, in pixels from the ball's centre, y up.
         radius: of the ball in pixels.
+        lens: of the camera; of an orthographic one the rim is left to `_add_rim`.
         samples: along each side of a pixel.
     """
     step = _subpixels(1, samples, latlong.device)
@@ -308,10 +326,37 @@ def _average_ball_pixels(
     batches = []
     for batch in corners.split(max(1, (1 << 20) // samples**2)):
         disc = (batch[:, None] + offsets) / radius
-        on_ball = (disc.square().sum(-1) <= 1).to(latlong)[..., None]
-        total = (sample_latlong(latlong, disc_directions(disc)) * on_ball).sum(dim=2)
-        batches.append(total / on_ball.sum(dim=1).clamp(min=1))
+        on_ball = disc.square().sum(-1) < math.cos(_RIM / 2) ** 2 if lens.equal_area else lens.on_ball(disc)
+        share = (on_ball.to(latlong) / samples**2)[..., None]
+        values = sample_latlong(latlong, lens.reflect(disc))
+        area = share.sum(dim=1).expand(len(values), -1, -1)
+        batches.append(torch.cat(((values * share).sum(dim=2), area), dim=-1))
     return torch.cat(batches, dim=1)
+
+
+def _add_rim(total: Float[Tensor, "b n k"], latlong: Latlong, radius: float, centre: tuple[float, float]) -> None:
+    """Add the rim of an orthographic ball to sums over pixels: rings about straight ahead, three to a map pixel."""
+    size = math.isqrt(total.shape[1])
+    rings = max(16, math.ceil(3 * latlong.shape[1] * _RIM / math.pi), math.ceil(radius / 2))
+    spokes = max(64, math.ceil(6 * math.pi * radius))
+    edges = torch.arange(rings + 1, device=latlong.device, dtype=torch.float64) * (_RIM / rings)
+    areas = (torch.sin(edges / 2).square().diff() * (math.pi * radius**2 / spokes)).to(latlong)
+    angle = ((edges[:-1] + edges[1:]) / 2).float()
+    for ring, ring_areas in zip(angle.split(64), areas.split(64), strict=True):
+        # Each ring is turned by the golden ratio of a step, so that spokes do not line up with pixels.
+        turn = torch.arange(len(ring), device=latlong.device)[:, None] * 0.618 + torch.arange(
+            spokes, device=latlong.device
+        )
+        x, y = (wave(turn * (2 * math.pi / spokes)) for wave in (torch.cos, torch.sin))
+        sine, cosine = torch.sin(ring)[:, None], torch.cos(ring)[:, None]
+        directions = torch.stack((sine * x, sine * y, -cosine.expand_as(x)), dim=-1).flatten(0, 1)
+        distance = radius * torch.cos(ring / 2)[:, None]
+        column, row = (centre[0] + distance * x).floor().long(), (centre[1] - distance * y).floor().long()
+        on_crop = ((column >= 0) & (column < size) & (row >= 0) & (row < size)).flatten()
+        values = sample_latlong(latlong, directions[on_crop])
+        weight = ring_areas[:, None].expand_as(x).flatten()[on_crop, None]
+        values = torch.cat((values * weight, weight.expand(len(values), -1, -1)), dim=-1)
+        total.index_add_(1, (row * size + column).flatten()[on_crop], values)
 
 
 def ball_to_latlong(
@@ -343,14 +388,15 @@ def ball_to_latlong(
         (B, height, 2 height, C). Differentiable in the ball.
 
     Raises:
-        OptionError: a crop that is not square, a height below 1, a radius not above 0, or samples outside 1 to 64.
+        OptionError: a crop that is not square, a height below 1, a radius not above 0, or samples outside 1 to 8.
 
     Source: DiffusionLight, Sec. 4 ("unwrapped to an environment map").
     """
     if ball.ndim != 4 or ball.shape[1] != ball.shape[2]:
         raise OptionError("ball", tuple(ball.shape), "shape (batch, side, side, channels)")
     _require_height(height)
-    _require_samples(samples)
+    if not 1 <= samples <= 8:
+        raise OptionError("samples", samples, "1 to 8 samples to a ball pixel's side")
     size = ball.shape[1]
     radius, centre = _placed(size, radius, centre)
     return unwrap(ball, Footprints(height, size, radius, centre, projection, samples, painted))

@@ -158,7 +158,7 @@ class _Pinhole:
         across = directions + toward[..., None] * axis
         length = torch.linalg.norm(across, dim=-1, keepdim=True)
         # Straight behind the ball there is no azimuth, and nothing is seen: any point of the outline will do.
-        sideways = torch.nn.functional.normalize(torch.linalg.cross(axis, axis.roll(1)), dim=-1)
+        sideways = torch.nn.functional.normalize(torch.linalg.cross(axis, axis.new_tensor([0.0, 1.0, 0.0])), dim=-1)
         across = torch.where(length > 0, across / length.clamp(min=1e-20), sideways)
         alpha = self._normal_angle(torch.atan2(length[..., 0], toward))[..., None]
         point = (self.distance - torch.cos(alpha)) * axis + torch.sin(alpha) * across

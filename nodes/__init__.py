@@ -6,7 +6,7 @@ from comfy_api.latest import ComfyExtension, io
 
 from .depth_ball import DepthBallMask
 from .envmap_files import LoadEnvMap, SaveEnvMap
-from .equirect import BallToEquirect
+from .equirect import BallToEquirect, EquirectToBall
 from .exposure import EVPromptInterp, HDRMerge
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
@@ -21,6 +21,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     IterativeMedian,
     HDRMerge,
     BallToEquirect,
+    EquirectToBall,
     SaveEnvMap,
     LoadEnvMap,
 )

@@ -1,4 +1,4 @@
-"""BallToEquirect: the ball unwrapped to an environment map."""
+"""BallToEquirect and EquirectToBall: between the ball and an environment map."""
 
 from __future__ import annotations
 
@@ -7,10 +7,32 @@ from comfy_api.latest import io
 
 from ..dl_core.ball import Ball, crop_ball, require_canvas
 from ..dl_core.errors import ImageError
-from ..dl_core.geometry import ball_to_latlong, camera_rotation, disc_coordinates, latlong_directions, rotate_latlong
+from ..dl_core.geometry import ball_to_latlong, camera_rotation, latlong_coverage, latlong_to_ball, rotate_latlong
+from ..dl_core.projection import PROJECTIONS
 from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 
-__all__ = ["BallToEquirect"]
+__all__ = ["BallToEquirect", "EquirectToBall"]
+
+
+def _camera_inputs() -> list[io.Input]:
+    """Widgets for how the camera sees the ball, the same on both nodes; appended, so that saved workflows load."""
+    return [
+        io.Combo.Input(
+            "projection",
+            options=list(PROJECTIONS),
+            optional=True,
+            tooltip="orthographic as in the paper, or perspective with the field of view below.",
+        ),
+        io.Float.Input(
+            "fov",
+            default=60.0,
+            min=1.0,
+            max=179.0,
+            step=1.0,
+            optional=True,
+            tooltip="Degrees that the whole picture spans along its longer side; used by perspective.",
+        ),
+    ]
 
 
 class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
@@ -39,10 +61,22 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                 ),
                 io.Int.Input(
                     "samples",
-                    default=4,
+                    default=1,
                     min=1,
-                    max=64,
-                    tooltip="Samples along each side of a pixel of the map: more is smoother where the ball is thin.",
+                    max=8,
+                    tooltip="Samples along each side of a ball pixel; the footprint of each pixel of the map is always "
+                    "covered, so 1 is enough.",
+                ),
+                *_camera_inputs(),
+                io.Float.Input(
+                    "frame",
+                    default=4.0,
+                    min=1.0,
+                    max=64.0,
+                    step=0.1,
+                    optional=True,
+                    tooltip="Ball crops without a ball connected: how many ball diameters the whole picture is wide; "
+                    "used by perspective.",
                 ),
             ],
             outputs=[
@@ -50,23 +84,96 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                 named_output(
                     io.Mask,
                     "coverage",
-                    "1 where the ball shows a direction; 0 straight ahead, within half a pixel of its rim.",
+                    "1 where the ball shows a direction; 0 straight ahead, within half a pixel of its rim, and in the cone "
+                    "behind a ball in perspective.",
                 ),
             ],
         )
 
     @classmethod
     def execute(
-        cls, image: torch.Tensor, height: int, yaw: float, samples: int, ball: Ball | None = None
+        cls,
+        image: torch.Tensor,
+        height: int,
+        yaw: float,
+        samples: int,
+        ball: Ball | None = None,
+        projection: str = "orthographic",
+        fov: float = 60.0,
+        frame: float = 4.0,
     ) -> io.NodeOutput:
         """Cut out, unwrap, turn."""
         crop = _cut_out(as_rgb(image, "image"), ball)
-        latlong = ball_to_latlong(crop, height, samples=samples, painted=True)
-        coverage = _coverage(height, crop.shape[1])
+        size = crop.shape[1]
+        camera = PROJECTIONS[projection](fov, *_picture(size, frame, ball))
+        latlong = ball_to_latlong(crop, height, samples=samples, painted=True, projection=camera)
+        coverage = latlong_coverage(height, size, projection=camera)[..., None]
         if yaw % 360:
             rotation = camera_rotation(yaw=yaw)
             latlong, coverage = (rotate_latlong(item, rotation) for item in (latlong, coverage))
         return io.NodeOutput(latlong, coverage[..., 0])
+
+
+def _picture(size: int, frame: float, ball: Ball | None) -> tuple[float, tuple[float, float]]:
+    """Side and middle of the whole picture, in pixels of a ball crop of a size, from its top-left corner."""
+    if ball is None:
+        return frame * size, (size / 2, size / 2)
+    return float(ball.canvas), (ball.canvas / 2 - ball.left, ball.canvas / 2 - ball.top)
+
+
+class EquirectToBall(io.ComfyNode):  # type: ignore[misc]
+    """Shows a map on a mirror ball."""
+
+    @classmethod
+    def define_schema(cls) -> io.Schema:
+        """Sockets of the node."""
+        return io.Schema(
+            node_id="EquirectToBall",
+            display_name="Equirect To Ball",
+            category=CATEGORY,
+            description="The mirror ball that a camera sees in the light of an equirectangular map: the inverse of "
+            "Ball To Equirect.",
+            inputs=[
+                io.Image.Input("latlong", tooltip="A map, twice as wide as high; normally linear radiance."),
+                io.Int.Input("diameter", default=256, min=8, max=4096, tooltip="Side of the ball's picture, pixels."),
+                io.Float.Input(
+                    "yaw",
+                    default=0.0,
+                    min=-360.0,
+                    max=360.0,
+                    step=1.0,
+                    tooltip="Degrees that the world is turned to the right before it is shown.",
+                ),
+                *_camera_inputs(),
+                io.Float.Input(
+                    "frame",
+                    default=4.0,
+                    min=1.0,
+                    max=64.0,
+                    step=0.1,
+                    optional=True,
+                    tooltip="How many ball diameters the whole picture is wide; used by perspective.",
+                ),
+            ],
+            outputs=[named_output(io.Image, "ball_image", "The ball, black around it, in the encoding of the map.")],
+        )
+
+    @classmethod
+    def execute(
+        cls,
+        latlong: torch.Tensor,
+        diameter: int,
+        yaw: float,
+        projection: str = "orthographic",
+        fov: float = 60.0,
+        frame: float = 4.0,
+    ) -> io.NodeOutput:
+        """Turn, reflect."""
+        latlong = as_rgb(latlong, "latlong")
+        if yaw % 360:
+            latlong = rotate_latlong(latlong, camera_rotation(yaw=yaw))
+        camera = PROJECTIONS[projection](fov, *_picture(diameter, frame, None))
+        return io.NodeOutput(latlong_to_ball(latlong, diameter, projection=camera))
 
 
 def _cut_out(image: torch.Tensor, ball: Ball | None) -> torch.Tensor:
@@ -76,9 +183,3 @@ def _cut_out(image: torch.Tensor, ball: Ball | None) -> torch.Tensor:
     if image.shape[1] != image.shape[2]:
         raise ImageError("image", f"is {image.shape[2]} x {image.shape[1]} pixels; a square ball crop is accepted")
     return image
-
-
-def _coverage(height: int, diameter: int) -> torch.Tensor:
-    """Where a ball of a diameter holds samples: (1, height, 2 height, 1)."""
-    radius = torch.linalg.norm(disc_coordinates(latlong_directions(height)), dim=-1)
-    return (radius <= 1 - 1 / diameter).float()[None, :, :, None]

@@ -314,15 +314,16 @@ def test_a_smooth_hdr_map_returns_within_one_percent() -> None:
     [
         # A sun 1.4 pixels wide is sampled 6 times a pixel: the tent's alias is sinc²(6.5) = 0.24% at the worst phase.
         *((elevation, azimuth, 3e-3) for elevation in (4.0, 30.0, 80.0) for azimuth in (20.0, 90.0, 180.0)),
-        # Straight ahead it lies in the last 1% of the rim's pixels, along the whole rim.
-        (0.0, 0.0, 0.04),
+        # Within 5 degrees of straight ahead it lies in slivers of the rim's pixels, the last that Sinkhorn's sweeps
+        # balance.
+        *((elevation, azimuth, 1e-2) for elevation, azimuth in ((0.0, 0.0), (2.0, 0.0), (0.0, 5.0), (-3.0, 3.0))),
     ],
 )
 def test_a_sun_keeps_its_energy(elevation: float, azimuth: float, tolerance: float) -> None:
     latlong = SunAndSky(sun=sun_direction(elevation, azimuth), sun_radius=1.0).latlong(128)
     energy = latlong_energy(latlong).sum()
     ball = latlong_to_ball(latlong, 256)
-    assert float(ball_energy(ball).sum() / energy) == pytest.approx(1, abs=tolerance)
+    assert float(ball_energy(ball).sum() / energy) == pytest.approx(1, abs=3e-3)
     assert float(latlong_energy(ball_to_latlong(ball, 128)).sum() / energy) == pytest.approx(1, abs=tolerance)
 
 

@@ -24,6 +24,7 @@ SOCKETS = {
     ),
     "HDRMerge": ("balls ev report", "hdr report"),
     "BallToEquirect": ("image ball", "latlong coverage"),
+    "EquirectToBall": ("latlong", "ball_image"),
     "SaveEnvMap": ("latlong report", "path"),
     "LoadEnvMap": ("", "latlong"),
 }
