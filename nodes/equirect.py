@@ -84,8 +84,8 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                 named_output(
                     io.Mask,
                     "coverage",
-                    "1 where the ball shows a direction; 0 straight ahead, within half a pixel of its rim, and in the cone "
-                    "behind a ball in perspective.",
+                    "1 where the ball shows a direction; 0 straight ahead, within half a pixel of its rim, and in the "
+                    "cone behind a ball in perspective.",
                 ),
             ],
         )
