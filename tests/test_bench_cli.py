@@ -78,7 +78,7 @@ def test_every_bench_has_what_the_contract_names(name: str) -> None:
     assert callable(module.run)
 
 
-@pytest.mark.parametrize("name", ["geometry", "merge"])
+@pytest.mark.parametrize("name", ["geometry", "oracle"])
 def test_a_folder_without_maps_is_named(name: str, tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "missing"):
         with pytest.raises(OptionError, match="--panoramas"):

@@ -31,7 +31,7 @@ class Bench:
 
 
 BENCHES: Final[dict[str, Bench]] = {
-    "merge": Bench("what unwrap and merge lose behind a perfect painter", ".merge"),
+    "oracle": Bench("what unwrap and merge lose behind a perfect painter", ".oracle"),
     "geometry": Bench("what latlong -> ball -> latlong loses", ".geometry"),
     "metrics": Bench("score a picture against the true one", ".pairs"),
     "protocol": Bench("score given maps by the paper's protocols", ".protocol"),

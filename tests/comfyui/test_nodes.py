@@ -303,7 +303,7 @@ def bracket(radiance: torch.Tensor, evs: list[float]) -> list[torch.Tensor]:
     return [expose(radiance, ev) for ev in evs]
 
 
-@pytest.mark.parametrize("method", ["channel", "paper"])
+@pytest.mark.parametrize("method", ["robust", "channel", "paper"])
 def test_merge_gathers_lists_and_returns_radiance(node: Nodes, method: str) -> None:
     radiance = torch.rand(1, 8, 8, 3, generator=torch.Generator().manual_seed(3)).mean(dim=-1, keepdim=True) * 20
     radiance, evs = radiance.expand(-1, -1, -1, 3), [0.0, -2.5, -5.0]

@@ -1,0 +1,261 @@
+"""What unwrap and merge lose when the painter makes no mistake, or only a known one.
+
+A true orthographic mirror ball of a known panorama, exposed at the bracket's EVs and rounded to 8 bits, goes through
+each combination of merge and unwrap; the map that comes out is compared with the panorama. With `--misaligned` the
+exposures disagree as `misalign` describes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from torch import Tensor
+
+from ..errors import OptionError
+from ..exposure import MERGES, auto_exposure, check_evs, expose, merge_bracket
+from ..geometry import ball_to_latlong, latlong_to_ball, latlong_to_perspective
+from ..imageio import read_envmap
+from ..metrics import angular_error, energy_kept, irradiance, si_rmse, spread_directions
+from ..presets import PAPER_EVS
+from ..shapes import BallImage, Latlong
+from .charts import bar_chart
+from .misalign import MISALIGNMENTS, misaligned_bracket
+from .reference import reference_merge, reference_unwrap
+from .report import (
+    Column,
+    Report,
+    Row,
+    add_output,
+    add_panoramas,
+    median_and_worst,
+    panorama_files,
+    prepare_output,
+    publish,
+)
+
+__all__ = ["EXPOSURES", "UNWRAPS", "WAYS", "Case", "add_arguments", "bench_oracle", "recover", "run", "summarize"]
+
+NORMALS: Final = 400
+LONG_EVS: Final = (*PAPER_EVS, -7.5, -10.0)
+ALIGNED: Final = next(iter(MISALIGNMENTS))
+
+UNWRAPS: Final[dict[str, Callable[[BallImage, int], Latlong]]] = {
+    # As `estimate` unwraps: what a painter leaves beside the ball is not looked at.
+    "footprint": lambda ball, height: ball_to_latlong(ball, height, painted=True),
+    "reference": reference_unwrap,
+}
+"""Ways from a ball to a map, the package's own first."""
+
+WAYS: Final = (*MERGES, "reference", "ceiling", "hdr")
+"""Merges of `MERGES`; the authors' order, which merges maps that are unwrapped and rounded; the true ball, clipped at
+the bracket's ceiling, which no merge can pass; the true ball."""
+
+EXPOSURES: Final[dict[str, Callable[[Latlong], Tensor]]] = {
+    "map": lambda latlong: latlong,
+    # The paper's own input: 256 x 192 pixels, 60 degrees high, that is 75.2 degrees wide.
+    "crop": lambda latlong: latlong_to_perspective(latlong, 192, 256, fov=75.18),
+}
+"""What the exposure is set on: the picture whose 99th percentile of intensity becomes 0.9 on display."""
+
+PROTOCOL: Final[Row] = {
+    "normals": NORMALS,
+    "bits": 8,
+    "gamma": 2.4,
+    "exposure": "99th percentile of all channel values to 0.9 on display",
+    "energy_kept": "radiance integrated over the sphere, channels summed, as a share of the truth's",
+    "irradiance_si_rmse": "one scale for all normals and channels, mean over both, relative to the mean irradiance",
+    "irradiance_angular_error_deg": "mean over normals of the angle between RGB irradiances",
+    "ldr_rmse": "of the map, display-encoded with gamma 2.4 and clipped at EV 0, over pixels and channels",
+    "worst": "the panorama furthest from the ideal: 1 for energy kept, 0 for the others",
+}
+
+IDEALS: Final = {
+    "energy_kept": 1.0,
+    "irradiance_si_rmse": 0.0,
+    "irradiance_angular_error_deg": 0.0,
+    "ldr_rmse": 0.0,
+}
+
+FIGURES: Final = (
+    Column("misaligned", "misaligned"),
+    Column("EVs", "evs"),
+    Column("merge", "merge"),
+    Column("unwrap", "unwrap"),
+    Column("energy kept", "energy_kept", ".3f"),
+    Column("irradiance si-RMSE", "irradiance_si_rmse", ".4f"),
+    Column("irradiance angle (deg)", "irradiance_angular_error_deg", ".2f"),
+    Column("LDR RMSE", "ldr_rmse", ".4f"),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way from a ball to a map.
+
+    Attributes:
+        misaligned: level of `MISALIGNMENTS`.
+        evs: of the bracket.
+        merge: of `WAYS`.
+        unwrap: of `UNWRAPS`.
+    """
+
+    misaligned: str
+    evs: tuple[float, ...]
+    merge: str
+    unwrap: str
+
+    def labels(self) -> Row:
+        """The case as it stands in a row."""
+        evs = ",".join(f"{ev:g}" for ev in self.evs)
+        return {"misaligned": self.misaligned, "evs": evs, "merge": self.merge, "unwrap": self.unwrap}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_panoramas(parser)
+    add_output(parser)
+    add = parser.add_argument
+    add("--evs", nargs="+", metavar="0,-2.5,-5", help="brackets (default: 0,-2.5,-5 and the same to -10)")
+    add("--merge", nargs="+", choices=WAYS, default=list(WAYS), help="merges; hdr is the true ball (default: all)")
+    add("--unwrap", nargs="+", choices=tuple(UNWRAPS), default=list(UNWRAPS), help="unwraps (default: all)")
+    add("--ball", type=int, default=256, metavar="PX", help="diameter of the ball (default: 256)")
+    add(
+        "--exposure",
+        choices=tuple(EXPOSURES),
+        default="map",
+        help="what EV 0 is set on: the whole map, or the paper's 60 degree crop straight ahead (default: map)",
+    )
+    add("--misaligned", nargs="*", choices=tuple(MISALIGNMENTS), help="levels; all without one (default: aligned)")
+    add("--seed", type=int, default=0, help="of misalignments (default: 0)")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure, write, draw and print.
+
+    Raises:
+        ProbeError: options, maps or folders that cannot be used.
+    """
+    started = time.perf_counter()
+    brackets = [PAPER_EVS, LONG_EVS] if args.evs is None else [_parse_evs(text) for text in args.evs]
+    levels = [ALIGNED] if args.misaligned is None else args.misaligned or list(MISALIGNMENTS)
+    if not 16 <= args.ball <= 4096:
+        raise OptionError("--ball", args.ball, "16 to 4096 pixels")
+    files = panorama_files(args.panoramas)
+    prepare_output(args)
+    cases = list(_cases(levels, brackets, args.merge, args.unwrap))
+    rows = bench_oracle(files, cases, ball=args.ball, exposure=args.exposure, seed=args.seed)
+    summary = summarize(rows)
+    report = Report("oracle", PROTOCOL, rows, summary, time.perf_counter() - started, seeds=(args.seed,))
+    if args.out is not None:
+        bars = [(" ".join(str(line[key]) for key in Case(ALIGNED, (), "", "").labels()), line) for line in summary]
+        bar_chart(args.out / "oracle", bars, "irradiance_si_rmse", "si-RMSE of irradiance, median and worst")
+    publish(report, args, rows=(Column("panorama", "panorama"), *FIGURES), summary=FIGURES)
+
+
+def _parse_evs(text: str) -> tuple[float, ...]:
+    try:
+        return check_evs([float(value) for value in text.split(",")])
+    except OptionError:
+        raise
+    except ValueError as error:
+        raise OptionError("--evs", text, "numbers and commas, such as 0,-2.5,-5") from error
+
+
+def _cases(
+    levels: Sequence[str], brackets: Sequence[tuple[float, ...]], merges: Sequence[str], unwraps: Sequence[str]
+) -> Iterator[Case]:
+    """Every combination that differs: the authors' order has its own unwrap, true balls are of no level or bracket."""
+    for level in levels:
+        for evs in brackets:
+            for merge in merges:
+                if (merge == "hdr" and (level, evs) != (levels[0], brackets[0])) or (
+                    merge == "ceiling" and level != levels[0]
+                ):
+                    continue
+                chosen = ["reference"] if merge == "reference" else unwraps
+                yield from (Case(level, evs, merge, unwrap) for unwrap in chosen)
+
+
+def recover(ball_hdr: BallImage, other_hdr: BallImage, case: Case, height: int, seed: int) -> Latlong:
+    """The map that a case makes of a ball.
+
+    Args:
+        ball_hdr: the true ball, linear radiance.
+        other_hdr: that of another scene, for misalignments that mix scenes.
+        case: the way.
+        height: rows of the map.
+        seed: of the misalignment.
+    """
+    if case.merge == "hdr":
+        return UNWRAPS[case.unwrap](ball_hdr, height)
+    if case.merge == "ceiling":
+        return UNWRAPS[case.unwrap](ball_hdr.clamp(max=2.0 ** -case.evs[-1]), height)
+    bracket = misaligned_bracket(ball_hdr, case.evs, case.misaligned, seed=seed, other=other_hdr)
+    if case.merge == "reference":
+        return reference_merge(bracket, case.evs, height)
+    return UNWRAPS[case.unwrap](merge_bracket(bracket, case.evs, case.merge), height)
+
+
+def bench_oracle(
+    panoramas: Sequence[Path], cases: Sequence[Case], *, ball: int = 256, exposure: str = "map", seed: int = 0
+) -> list[Row]:
+    """Measure every case on every panorama.
+
+    Args:
+        panoramas: files of linear radiance.
+        cases: ways from a ball to a map.
+        ball: its diameter in pixels.
+        exposure: key of `EXPOSURES`.
+        seed: of misalignments; each panorama has its own, by name.
+
+    Returns:
+        One row a panorama and case: their names, and the figures of `PROTOCOL`. The other scene of a misalignment is
+        the panorama before it, for the first one the last.
+    """
+    normals = spread_directions(NORMALS)
+    other = latlong_to_ball(_exposed(panoramas[-1], exposure), ball)
+    rows: list[Row] = []
+    for path in panoramas:
+        latlong = _exposed(path, exposure)
+        truth, shown = irradiance(latlong, normals), expose(latlong, 0.0)
+        true_ball = latlong_to_ball(latlong, ball)
+        for case in cases:
+            found = recover(true_ball, other, case, latlong.shape[1], seed + zlib.crc32(path.stem.encode()))
+            lit = irradiance(found, normals)
+            rows.append(
+                {
+                    "panorama": path.stem,
+                    **case.labels(),
+                    "ball_px": ball,
+                    "energy_kept": energy_kept(found, latlong),
+                    "irradiance_si_rmse": si_rmse(lit, truth),
+                    "irradiance_angular_error_deg": angular_error(lit, truth),
+                    "ldr_rmse": float((expose(found, 0.0) - shown).square().mean().sqrt()),
+                }
+            )
+        other = true_ball
+    return rows
+
+
+def _exposed(path: Path, exposure: str) -> Latlong:
+    latlong = read_envmap(path)
+    return latlong * auto_exposure(EXPOSURES[exposure](latlong))
+
+
+def summarize(rows: Sequence[Row]) -> list[Row]:
+    """Median and worst over the panoramas, a row for each case, in the order of the cases."""
+    names = ("misaligned", "evs", "merge", "unwrap")
+    summary = []
+    for labels in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
+        of_case = [row for row in rows if tuple(row[name] for name in names) == labels]
+        line: Row = {**dict(zip(names, labels, strict=True)), "panoramas": len(of_case)}
+        for key, ideal in IDEALS.items():
+            line |= median_and_worst(of_case, key, ideal=ideal)
+        summary.append(line)
+    return summary
