@@ -81,7 +81,7 @@ def _shares(source: int, target: int, *, solid_angle: bool) -> Float[Tensor, "ta
     return (overlap.clamp(min=0) / high.diff()[:, None]).float()
 
 
-def reduce_map(latlong: Latlong, height: int, *, solid_angle: bool) -> Latlong:
+def reduce_map(latlong: Latlong, height: int, *, solid_angle: bool) -> Float[Tensor, "b rows columns c"]:
     """Average a map over the pixels of one of another size, exactly, whatever the two sizes are.
 
     Args:
@@ -92,7 +92,8 @@ def reduce_map(latlong: Latlong, height: int, *, solid_angle: bool) -> Latlong:
     """
     rows = _shares(latlong.shape[1], height, solid_angle=solid_angle)
     columns = _shares(latlong.shape[2], 2 * height, solid_angle=False)
-    return torch.einsum("ri,sj,bijc->brsc", rows, columns, latlong)
+    # One axis after the other: both at once would be a matrix of all pixels by all pixels.
+    return torch.einsum("sj,brjc->brsc", columns, torch.einsum("ri,bijc->brjc", rows, latlong))
 
 
 def compress(latlong_hdr: Latlong) -> Latlong:
@@ -105,7 +106,7 @@ def compress(latlong_hdr: Latlong) -> Latlong:
     return encoded * (0.5 / float(np.median(lit.numpy()))) if lit.numel() else encoded
 
 
-def prepare_map(latlong_hdr: Latlong, convention: Convention) -> Latlong:
+def prepare_map(latlong_hdr: Latlong, convention: Convention) -> Float[Tensor, "b rows columns c"]:
     """A map as spheres are lit by it under a convention: (1, 128, 256, 3)."""
     reduced = reduce_map(latlong_hdr, MAP_ROWS, solid_angle=not convention.compressed)
     return compress(reduced) if convention.compressed else reduced
@@ -163,7 +164,9 @@ PROTOCOLS: Final[dict[str, Protocol]] = {
 """Protocols by name."""
 
 
-def score_maps(predicted_hdr: Latlong, truth_hdr: Latlong, name: str, convention: str) -> list[Row]:
+def score_maps(
+    predicted_hdr: Latlong, truth_hdr: Float[Tensor, "b rows columns c"], name: str, convention: str
+) -> list[Row]:
     """Errors of a map: one row for each sphere.
 
     Args:

@@ -1,0 +1,168 @@
+"""`bench protocol`: pairing, reduction and compression of maps, scores, and going on where a run stopped."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tolerances import assert_close
+
+from dl_core.bench import protocol
+from dl_core.errors import ImageError, OptionError, OutputError
+from dl_core.geometry import latlong_energy
+from dl_core.imageio import write_exr, write_hdr
+from dl_core.picture_errors import CONVENTIONS
+
+
+@pytest.fixture(autouse=True)
+def small_spheres(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spheres of 16 pixels under maps of 16 rows: what is tested here does not depend on their size."""
+    monkeypatch.setattr(protocol, "SPHERE", 16)
+    monkeypatch.setattr(protocol, "FRAME", (31, 55))
+    monkeypatch.setattr(protocol, "MAP_ROWS", 16)
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    """Three pairs of maps; one pair has another size and format than its partner."""
+    predicted, truth = tmp_path / "predicted", tmp_path / "truth"
+    generator = torch.Generator().manual_seed(9)
+    for folder in (predicted, truth):
+        folder.mkdir()
+        for name in ("a", "b"):
+            write_exr(folder / f"{name}.exr", torch.rand(16, 32, 3, generator=generator) + 0.1, metadata={})
+    write_exr(predicted / "c.exr", torch.full((24, 48, 3), 2.0), metadata={})
+    write_hdr(truth / "c.hdr", torch.full((16, 32, 3), 1.0))
+    return predicted, truth
+
+
+def run(folders: tuple[Path, Path], *options: object) -> None:
+    parser = argparse.ArgumentParser()
+    protocol.add_arguments(parser)
+    words = ["three-spheres", "--maps", folders[0], "--truth", folders[1], *options]
+    assert not protocol.run(parser.parse_args([str(word) for word in words]))
+
+
+# --- maps --------------------------------------------------------------------------------------------------------
+
+
+@given(source=st.integers(1, 40), target=st.integers(1, 40), seed=st.integers(0, 99))
+def test_reduction_keeps_energy_or_the_mean_at_any_sizes(source: int, target: int, seed: int) -> None:
+    latlong = torch.rand(1, source, 2 * source, 3, generator=torch.Generator().manual_seed(seed))
+    radiance = protocol.reduce_map(latlong, target, solid_angle=True)
+    # Solid angles of thin polar rows come from differences of float32 cosines in `latlong_energy`.
+    torch.testing.assert_close(latlong_energy(radiance), latlong_energy(latlong), rtol=1e-4, atol=0)
+    picture = protocol.reduce_map(latlong, target, solid_angle=False)
+    assert_close(picture.mean(dim=(1, 2)), latlong.mean(dim=(1, 2)), dtype=torch.float32)
+    if source == target:
+        assert_close(radiance, latlong)
+
+
+@given(scale=st.floats(1e-3, 1e3), seed=st.integers(0, 99))
+def test_compression_puts_the_median_of_the_light_at_one_half(scale: float, seed: int) -> None:
+    latlong = torch.rand(1, 8, 16, 3, generator=torch.Generator().manual_seed(seed)) + 0.1
+    latlong[:, :3] = 0  # left out of the median
+    latlong[0, 5, 5] = 1e4  # not clipped
+    compressed = protocol.compress(latlong * scale)
+    lit = compressed[compressed > 0].double().numpy()
+    assert np.median(lit) == pytest.approx(0.5, rel=1e-6)
+    ratio = float(compressed[0, 5, 5, 0] / compressed[0, 6, 6, 0])
+    assert ratio == pytest.approx((1e4 / float(latlong[0, 6, 6, 0])) ** (1 / 2.4), rel=1e-5)
+    assert not protocol.compress(torch.zeros(1, 8, 16, 3)).any()
+
+
+def test_the_sphere_covers_its_share_of_the_public_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    # The public renders have 61,451 pixels of 540 x 960 on the ball.
+    share = math.pi / 4 * protocol.SPHERE**2 / math.prod(protocol.FRAME)
+    assert share == pytest.approx(61451 / (540 * 960), rel=0.01)
+    assert protocol.FRAME[1] / protocol.FRAME[0] == pytest.approx(960 / 540, rel=0.01)
+
+
+# --- scores ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("convention", ["published", "radiance"])
+def test_a_map_has_no_error_against_itself_at_any_exposure(convention: str) -> None:
+    latlong = torch.rand(1, 16, 32, 3, generator=torch.Generator().manual_seed(4)) + 0.1
+    rows = protocol.score_maps(latlong * 4, latlong, "three-spheres", convention)
+    assert [row["sphere"] for row in rows] == list(protocol.SPHERES)
+    for row in rows:
+        for key in ("si_rmse", "angular_error_deg", "normalized_rmse"):
+            # Rounding of float32 renders; the angle is the most sensitive: 1e-7 of a radian times a few.
+            assert row[key] == pytest.approx(0, abs=1e-4)
+        # Compression sets the exposure by itself, so even the plain error is nought.
+        assert (row["rmse"] < 1e-4) == CONVENTIONS[convention].compressed
+
+
+# --- runs --------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_reports_every_sphere_of_every_map(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    run(folders, "--convention", "published", "--out", out, "--json")
+    result = json.loads(capsys.readouterr().out)
+    assert result == json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert {(row["panorama"], row["sphere"]) for row in result["rows"]} == {
+        (name, sphere) for name in "abc" for sphere in protocol.SPHERES
+    }
+    assert {"panorama", "sphere", "si_rmse", "angular_error_deg", "normalized_rmse"} <= set(result["rows"][0])
+    assert [line["sphere"] for line in result["summary"]] == list(protocol.SPHERES)
+    assert result["protocol"]["convention"] == "published"
+    assert str(tmp_path) not in json.dumps(result)
+    assert str(tmp_path) not in (out / "rows.jsonl").read_text(encoding="utf-8")
+    # The last pair differs in exposure alone.
+    assert all(row["si_rmse"] < 1e-4 for row in result["rows"] if row["panorama"] == "c")
+
+
+def test_a_stopped_run_goes_on_and_loses_one_image_at_most(
+    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, journal = tmp_path / "out", tmp_path / "out" / "rows.jsonl"
+    run(folders, "--out", out)
+    whole, report = journal.read_text(encoding="utf-8"), json.loads((out / "report.json").read_text(encoding="utf-8"))
+    (out / "report.json").unlink()
+    scored: list[Path] = []
+    read = protocol.read_envmap
+    monkeypatch.setattr(protocol, "read_envmap", lambda path: scored.append(path) or read(path))
+    journal.write_text(whole[:-40], encoding="utf-8")  # killed while the last line was written
+    run(folders, "--out", out)
+    assert [path.stem for path in scored] == ["c", "c"]
+    assert journal.read_text(encoding="utf-8") == whole
+    assert json.loads((out / "report.json").read_text(encoding="utf-8"))["rows"] == report["rows"]
+
+
+def test_a_run_with_other_options_is_refused_and_touches_nothing(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run(folders, "--out", out)
+    before = (out / "rows.jsonl").read_text(encoding="utf-8")
+    with pytest.raises(OutputError, match=r"rows\.jsonl: was begun with other options \(convention 'radiance'\)"):
+        run(folders, "--out", out, "--convention", "published")
+    with pytest.raises(OutputError, match="folders"):
+        run((folders[1], folders[0]), "--out", out)
+    assert (out / "rows.jsonl").read_text(encoding="utf-8") == before
+
+
+def test_maps_without_a_partner_are_named(folders: tuple[Path, Path]) -> None:
+    (folders[1] / "b.exr").unlink()
+    with pytest.raises(ImageError, match="--truth: has no partner for 1 maps of the other folder: b"):
+        run(folders)
+    with pytest.raises(ImageError, match="--maps: has no partner for 1 maps of the other folder: b"):
+        run((folders[1], folders[0]))
+
+
+def test_folders_are_checked(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="--truth"):
+        run((folders[0], tmp_path / "none"))
+    write_hdr(folders[0] / "a.hdr", torch.ones(4, 8, 3))
+    with pytest.raises(OptionError, match=r"--maps.*in another format too"):
+        run(folders)
