@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dl_core import cli
 from dl_core.bench.cameras import CAMERAS, Camera, random_camera, take
 from dl_core.bench.paintings import VARIANTS, Painting, Variant, paint_maps, planned
 from dl_core.bench.perfect import PerfectPainter
@@ -19,7 +22,7 @@ from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_pers
 from dl_core.imageio import read_envmap, write_exr
 from dl_core.iterative import Rounds
 from dl_core.painter import Painter
-from dl_core.presets import Preset
+from dl_core.presets import PRESETS, Preset
 
 PRESET = Preset(Rounds(balls=2, rounds=1, steps=2, final=False), (0.0, -2.5, -5.0), "short")
 SETTINGS = Settings(canvas=256, diameter=128, height=64)
@@ -102,3 +105,58 @@ def test_every_photograph_of_a_run_has_its_own_name(panorama: Path) -> None:
     shots = [painting.shot for painting in planned([panorama], "array", ["base"], 0)]
     assert len(set(shots)) == len(shots) == 10
     assert Painting(panorama, Camera(), "base").shot.startswith("smooth.")
+
+
+def protocol(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+    assert cli.main(["bench", "protocol", *(str(word) for word in words), "--json"]) == 0
+    return dict(json.loads(capsys.readouterr().out))
+
+
+def lamp(tmp_path: Path) -> Path:
+    """A grey room with a warm lamp of radiance 8 behind the camera: above white, below what EV -5 shows."""
+    directions = latlong_directions(64)
+    lit = (directions @ torch.tensor([0.6, 0.0, 0.8]) > 0.95).float()[..., None] * torch.tensor([8.0, 6.0, 3.0])
+    return write_exr(tmp_path / "lamp.exr", 0.3 + 0.2 * directions[..., 1:2] + lit, metadata={})
+
+
+def test_the_command_paints_and_scores_and_a_bracket_beats_one_exposure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lamp(tmp_path).parent
+    words = ("three-spheres", "--panoramas", folder, "--painter", "perfect", "--variants", "base,both")
+    report = protocol(capsys, *words, "--out", tmp_path / "out")
+    rows = {(row["variant"], row["sphere"]): row for row in report["rows"]}
+    for sphere in ("diffuse", "mirror"):
+        assert rows["both", sphere]["si_rmse"] < 0.5 * rows["base", sphere]["si_rmse"]
+        assert rows["both", sphere]["angular_error_deg"] < 0.5 * rows["base", sphere]["angular_error_deg"]
+    draft = PRESETS["draft"]
+    # Two evaluations a guided step; the base paints one ball of one exposure.
+    assert report["evaluations"] == 2 * (draft.guided_steps + draft.rounds.steps)
+    assert {row["data"] for row in report["protocol"]["published"]} == {"Laval Indoor (289)", "Poly Haven (500)"}
+    assert (tmp_path / "out" / "report.json").is_file()
+
+
+def test_maps_compared_as_pictures_are_toned_by_their_own_light(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = lamp(tmp_path).parent
+    words = ("ldr", "--panoramas", folder, "--painter", "perfect", "--variants", "base,both", "--out", tmp_path / "out")
+    base, both = protocol(capsys, *words)["rows"]
+    # The lamp holds the 99th percentile: a map without it is toned too bright everywhere.
+    assert both["rmse"] < 0.2 * base["rmse"]
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ((), "--panoramas"),
+        (("--panoramas", "x", "--maps", "y", "--out", "z"), "--panoramas"),
+        (("--panoramas", "x"), "--out"),
+        (("--panoramas", "x", "--out", "z", "--variants", "best"), "--variants"),
+    ],
+)
+def test_options_that_do_not_go_together_are_named(
+    words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["bench", "protocol", "three-spheres", *words]) == 2
+    assert named in capsys.readouterr().err

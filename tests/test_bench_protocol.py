@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tolerances import assert_close
 
-from dl_core.bench import protocol
+from dl_core.bench import given_maps, protocol, scoring
 from dl_core.errors import ImageError, OptionError, OutputError
 from dl_core.geometry import latlong_energy
 from dl_core.imageio import write_exr, write_hdr
@@ -24,9 +24,9 @@ from dl_core.picture_errors import CONVENTIONS
 @pytest.fixture(autouse=True)
 def small_spheres(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spheres of 16 pixels under maps of 16 rows: what is tested here does not depend on their size."""
-    monkeypatch.setattr(protocol, "SPHERE", 16)
-    monkeypatch.setattr(protocol, "FRAME", (31, 55))
-    monkeypatch.setattr(protocol, "MAP_ROWS", 16)
+    monkeypatch.setattr(scoring, "SPHERE", 16)
+    monkeypatch.setattr(scoring, "FRAME", (31, 55))
+    monkeypatch.setattr(scoring, "MAP_ROWS", 16)
 
 
 @pytest.fixture
@@ -56,10 +56,10 @@ def run(folders: tuple[Path, Path], *options: object) -> None:
 @given(source=st.integers(1, 40), target=st.integers(1, 40), seed=st.integers(0, 99))
 def test_reduction_keeps_energy_or_the_mean_at_any_sizes(source: int, target: int, seed: int) -> None:
     latlong = torch.rand(1, source, 2 * source, 3, generator=torch.Generator().manual_seed(seed))
-    radiance = protocol.reduce_map(latlong, target, solid_angle=True)
+    radiance = scoring.reduce_map(latlong, target, solid_angle=True)
     # Solid angles of thin polar rows come from differences of float32 cosines in `latlong_energy`.
     torch.testing.assert_close(latlong_energy(radiance), latlong_energy(latlong), rtol=1e-4, atol=0)
-    picture = protocol.reduce_map(latlong, target, solid_angle=False)
+    picture = scoring.reduce_map(latlong, target, solid_angle=False)
     assert_close(picture.mean(dim=(1, 2)), latlong.mean(dim=(1, 2)), dtype=torch.float32)
     if source == target:
         assert_close(radiance, latlong)
@@ -70,20 +70,20 @@ def test_compression_puts_the_median_of_the_light_at_one_half(scale: float, seed
     latlong = torch.rand(1, 8, 16, 3, generator=torch.Generator().manual_seed(seed)) + 0.1
     latlong[:, :3] = 0  # left out of the median
     latlong[0, 5, 5] = 1e4  # not clipped
-    compressed = protocol.compress(latlong * scale)
+    compressed = scoring.compress(latlong * scale)
     lit = compressed[compressed > 0].double().numpy()
     assert np.median(lit) == pytest.approx(0.5, rel=1e-6)
     ratio = float(compressed[0, 5, 5, 0] / compressed[0, 6, 6, 0])
     assert ratio == pytest.approx((1e4 / float(latlong[0, 6, 6, 0])) ** (1 / 2.4), rel=1e-5)
-    assert not protocol.compress(torch.zeros(1, 8, 16, 3)).any()
+    assert not scoring.compress(torch.zeros(1, 8, 16, 3)).any()
 
 
 def test_the_sphere_covers_its_share_of_the_public_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     # The public renders have 61,451 pixels of 540 x 960 on the ball.
-    share = math.pi / 4 * protocol.SPHERE**2 / math.prod(protocol.FRAME)
+    share = math.pi / 4 * scoring.SPHERE**2 / math.prod(scoring.FRAME)
     assert share == pytest.approx(61451 / (540 * 960), rel=0.01)
-    assert protocol.FRAME[1] / protocol.FRAME[0] == pytest.approx(960 / 540, rel=0.01)
+    assert scoring.FRAME[1] / scoring.FRAME[0] == pytest.approx(960 / 540, rel=0.01)
 
 
 # --- scores ------------------------------------------------------------------------------------------------------
@@ -92,8 +92,8 @@ def test_the_sphere_covers_its_share_of_the_public_frame(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("convention", ["published", "radiance"])
 def test_a_map_has_no_error_against_itself_at_any_exposure(convention: str) -> None:
     latlong = torch.rand(1, 16, 32, 3, generator=torch.Generator().manual_seed(4)) + 0.1
-    rows = protocol.score_maps(latlong * 4, latlong, "three-spheres", convention)
-    assert [row["sphere"] for row in rows] == list(protocol.SPHERES)
+    rows = given_maps.score_maps(latlong * 4, latlong, "three-spheres", convention)
+    assert [row["sphere"] for row in rows] == list(scoring.SPHERES)
     for row in rows:
         for key in ("si_rmse", "angular_error_deg", "normalized_rmse"):
             # Rounding of float32 renders; the angle is the most sensitive: 1e-7 of a radian times a few.
@@ -113,10 +113,10 @@ def test_a_run_reports_every_sphere_of_every_map(
     result = json.loads(capsys.readouterr().out)
     assert result == json.loads((out / "report.json").read_text(encoding="utf-8"))
     assert {(row["panorama"], row["sphere"]) for row in result["rows"]} == {
-        (name, sphere) for name in "abc" for sphere in protocol.SPHERES
+        (name, sphere) for name in "abc" for sphere in scoring.SPHERES
     }
     assert {"panorama", "sphere", "si_rmse", "angular_error_deg", "normalized_rmse"} <= set(result["rows"][0])
-    assert [line["sphere"] for line in result["summary"]] == list(protocol.SPHERES)
+    assert [line["sphere"] for line in result["summary"]] == list(scoring.SPHERES)
     assert result["protocol"]["convention"] == "published"
     assert str(tmp_path) not in json.dumps(result)
     assert str(tmp_path) not in (out / "rows.jsonl").read_text(encoding="utf-8")
@@ -132,8 +132,8 @@ def test_a_stopped_run_goes_on_and_loses_one_image_at_most(
     whole, report = journal.read_text(encoding="utf-8"), json.loads((out / "report.json").read_text(encoding="utf-8"))
     (out / "report.json").unlink()
     scored: list[Path] = []
-    read = protocol.read_envmap
-    monkeypatch.setattr(protocol, "read_envmap", lambda path: scored.append(path) or read(path))
+    read = given_maps.read_envmap
+    monkeypatch.setattr(given_maps, "read_envmap", lambda path: scored.append(path) or read(path))
     journal.write_text(whole[:-40], encoding="utf-8")  # killed while the last line was written
     run(folders, "--out", out)
     assert [path.stem for path in scored] == ["c", "c"]

@@ -1,0 +1,150 @@
+"""`lightprobe bench protocol NAME --panoramas DIR --painter NAME`: paint maps by a protocol and score them.
+
+The paper's ablation rows are variants of one run; its printed figures stand below ours, with the data they are on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from statistics import fmean
+from typing import Final
+
+from ..backends.loading import ModelFiles
+from ..errors import OptionError
+from ..estimate import Settings
+from ..imageio import read_envmap, read_exr_header
+from ..presets import Preset, preset
+from .cameras import CAMERAS
+from .painters import PAINTERS, open_studio
+from .paintings import VARIANTS, Painting, paint_maps, planned
+from .published import PUBLISHED
+from .report import Column, Report, Row, median_and_worst, panorama_files, prepare_output, publish, table
+from .scoring import PROTOCOLS, score_maps
+
+__all__ = ["add_arguments", "run"]
+
+_FIGURES: Final = ("rmse", "si_rmse", "angular_error_deg", "normalized_rmse")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of a painted run."""
+    group = parser.add_argument_group("to paint the maps first")
+    add = group.add_argument
+    add("--panoramas", type=Path, metavar="DIR", help="folder of true EXR or HDR maps, instead of --maps and --truth")
+    add("--painter", default="mini", help=f"{', '.join(PAINTERS)} (default: mini)")
+    add("--variants", default="both", help=f"rows of the ablation: {','.join(VARIANTS)}, or all (default: both)")
+    add("--preset", default="draft", help="schedule and bracket (default: draft)")
+    add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
+    for name, what in (("model", "checkpoint"), ("controlnet", "depth ControlNet"), ("lora", "exposure LoRA")):
+        add(f"--{name}", metavar="PATH", help=f"{what} of the painter, as for estimate")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Paint what the folder of `--out` does not hold yet, then score every map in it.
+
+    Raises:
+        OptionError: no `--out`, an unknown painter, variant or preset, or a folder of another run.
+    """
+    if args.out is None:
+        raise OptionError("--out", None, "a folder for the painted maps")
+    variants = _variants(args.variants)
+    paintings = list(planned(panorama_files(args.panoramas), args.protocol, variants, args.seed))
+    chosen = preset(args.preset)
+    prepare_output(args)
+    started = time.perf_counter()
+    studio = open_studio(args.painter, ModelFiles.of(args))
+    settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
+    paint_maps(paintings, studio.painter_of, chosen, settings, args.out, report=_say)
+    rows = [row for painting in paintings for row in _score(painting, args)]
+    report = Report(
+        f"protocol {args.protocol}",
+        _description(args, settings, chosen),
+        rows,
+        _summarize(rows),
+        time.perf_counter() - started,
+        seeds=(args.seed,),
+        evaluations=sum({row["variant"] + row["shot"]: row["evaluations"] for row in rows}.values()),
+    )
+    publish(report, args, rows=_ROWS, summary=_SUMMARY)
+    if not args.json:
+        sys.stdout.write(
+            "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
+        )
+    return 0
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(line + "\n")
+
+
+def _variants(text: str) -> list[str]:
+    names = list(VARIANTS) if text == "all" else text.split(",")
+    for name in names:
+        if name not in VARIANTS:
+            raise OptionError("--variants", name, ", ".join((*VARIANTS, "all")))
+    return names
+
+
+def _score(painting: Painting, args: argparse.Namespace) -> list[Row]:
+    path = args.out / "maps" / painting.variant / f"{painting.shot}.exr"
+    truth = read_envmap(args.out / "truth" / f"{painting.shot}.exr")
+    head = {
+        "panorama": painting.panorama.stem,
+        "shot": painting.shot,
+        "variant": painting.variant,
+        "evaluations": int(read_exr_header(path)["lightprobe:nfe"]),
+    }
+    return [{**head, **row} for row in score_maps(read_envmap(path), truth, args.protocol, args.convention)]
+
+
+def _description(args: argparse.Namespace, settings: Settings, chosen: Preset) -> Row:
+    return {
+        "name": args.protocol,
+        "convention": args.convention,
+        "painter": args.painter,
+        "preset": args.preset,
+        "merge": settings.merge,
+        "evs": list(chosen.evs),
+        "canvas_px": settings.canvas,
+        "ball_px": settings.diameter,
+        "cameras": [camera.name for camera in CAMERAS[args.protocol]("", args.seed)]
+        if args.protocol != "random-camera"
+        else "drawn for each panorama: fov 30 to 150, elevation -45 to 45, any azimuth",
+        "scored": PROTOCOLS[args.protocol].summary,
+        **PROTOCOLS[args.protocol].conditions,
+        "published": [asdict(row) for row in PUBLISHED if row.protocol == args.protocol],
+    }
+
+
+def _summarize(rows: list[Row]) -> list[Row]:
+    """Mean, median and worst for each variant and sphere; the paper prints means."""
+    summary = []
+    for variant in VARIANTS:
+        for sphere in dict.fromkeys(row["sphere"] for row in rows):
+            own = [row for row in rows if row["variant"] == variant and row["sphere"] == sphere]
+            if not own:
+                continue
+            line: Row = {"method": VARIANTS[variant].label, "sphere": sphere, "maps": len(own)}
+            for key in _FIGURES:
+                line[key] = fmean(row[key] for row in own)
+                line |= median_and_worst(own, key)
+            summary.append(line)
+    return summary
+
+
+def _published(protocol: str) -> list[Row]:
+    return [asdict(row) for row in PUBLISHED if row.protocol == protocol]
+
+
+_FIGURE_COLUMNS: Final = (
+    Column("si-RMSE", "si_rmse", ".3f"),
+    Column("angle (deg)", "angular_error_deg", ".2f"),
+    Column("normalized RMSE", "normalized_rmse", ".3f"),
+)
+_ROWS: Final = (Column("shot", "shot"), Column("variant", "variant"), Column("sphere", "sphere"), *_FIGURE_COLUMNS)
+_SUMMARY: Final = (Column("method", "method"), Column("sphere", "sphere"), Column("maps", "maps"), *_FIGURE_COLUMNS)
+_PUBLISHED: Final = (Column("data", "data"), Column("method", "method"), Column("sphere", "sphere"), *_FIGURE_COLUMNS)

@@ -1,0 +1,201 @@
+"""Score an environment map against the true one by what it lights, as the paper scores its own.
+
+Three spheres: both maps are reduced to 128 x 256, compressed if the convention says so, spheres of each material are
+rendered under both, and the pictures are compared. LDR maps: both are reduced to 256 x 512, tone-mapped each by itself,
+and compared as they are.
+
+Sources: DiffusionLight, Sec. 5.1 (three spheres), 5.2 (random camera) and 5.3 (LDR panoramas); Wang et al., StyleLight
+(ECCV 2022), for size and compression of the maps, whose public code takes the median over values above 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..exposure import GAMMA, auto_exposure, expose
+from ..geometry import ball_coverage
+from ..picture_errors import CONVENTIONS, Convention, picture_errors
+from ..shapes import Latlong
+from ..spheres import MATERIALS, render_spheres
+from .report import Row
+
+__all__ = [
+    "FRAME",
+    "MAP_ROWS",
+    "PROTOCOLS",
+    "SPHERE",
+    "SPHERES",
+    "Lit",
+    "Protocol",
+    "compress",
+    "prepare_map",
+    "reduce_map",
+    "render_three",
+    "score_maps",
+]
+
+MAP_ROWS: Final = 128
+"""Rows that maps are reduced to before anything is lit by them."""
+LDR_ROWS: Final = 256
+"""Rows of the maps that are compared as pictures."""
+SPHERE: Final = 128
+"""Diameter of a rendered sphere in pixels."""
+FRAME: Final = (247, 439)
+"""Rows and columns of the frame a sphere is centred in: it covers the share it has in the public renders, 280 pixels in
+540 x 960, which is what the percentiles of the published normalized RMSE are taken over."""
+SPHERES: Final = tuple(name for name in ("diffuse", "matte", "mirror") if name in MATERIALS)
+"""Spheres that are scored, as far as `spheres` can render them."""
+
+
+# --- maps --------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=16)
+def _shares(source: int, target: int, *, solid_angle: bool) -> Float[Tensor, "target source"]:
+    """How much of each target row (or column) each source row makes up; every line sums to 1."""
+    edges = [torch.linspace(0, math.pi, count + 1, dtype=torch.float64) for count in (source, target)]
+    low, high = (-torch.cos(edge) if solid_angle else edge for edge in edges)
+    overlap = torch.minimum(low[None, 1:], high[1:, None]) - torch.maximum(low[None, :-1], high[:-1, None])
+    return (overlap.clamp(min=0) / high.diff()[:, None]).float()
+
+
+def reduce_map(latlong: Latlong, height: int, *, solid_angle: bool) -> Float[Tensor, "b rows columns c"]:
+    """Average a map over the pixels of one of another size, exactly, whatever the two sizes are.
+
+    Args:
+        latlong: (B, H, 2H, C).
+        height: rows of the result.
+        solid_angle: weigh by solid angle, which keeps the energy of radiance; otherwise by area of the picture, as
+            tools for pictures do.
+    """
+    rows = _shares(latlong.shape[1], height, solid_angle=solid_angle)
+    columns = _shares(latlong.shape[2], 2 * height, solid_angle=False)
+    # One axis after the other: both at once would be a matrix of all pixels by all pixels.
+    return torch.einsum("sj,brjc->brsc", columns, torch.einsum("ri,bijc->brjc", rows, latlong))
+
+
+def compress(latlong_hdr: Latlong) -> Latlong:
+    """Gamma-compress a map as the public evaluation does: γ-2.4, then the median of what is above 0 to 0.5, no clip.
+
+    A map without light stays black.
+    """
+    encoded = latlong_hdr.clamp(min=0) ** (1 / GAMMA)
+    lit = encoded[encoded > 0]
+    return encoded * (0.5 / float(np.median(lit.numpy()))) if lit.numel() else encoded
+
+
+def prepare_map(latlong_hdr: Latlong, convention: Convention) -> Float[Tensor, "b rows columns c"]:
+    """A map as spheres are lit by it under a convention: (1, 128, 256, 3)."""
+    reduced = reduce_map(latlong_hdr, MAP_ROWS, solid_angle=not convention.compressed)
+    return compress(reduced) if convention.compressed else reduced
+
+
+# --- spheres -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lit:
+    """A sphere under the maps of a batch.
+
+    Attributes:
+        pictures: (B, h, w, 3) linear values, black around the sphere.
+        mask: (h, w), True on the sphere.
+    """
+
+    pictures: Float[Tensor, "b h w 3"]
+    mask: Bool[Tensor, "h w"]
+
+
+def render_three(latlong: Latlong) -> dict[str, Lit]:
+    """The spheres under a batch of maps, by name, seen from the front and centred in `FRAME`."""
+    mask = _in_frame((ball_coverage(SPHERE) > 0)[None, ..., None])[0, ..., 0]
+    balls = render_spheres(latlong, SPHERE, SPHERES)
+    return {name: Lit(_in_frame(ball), mask) for name, ball in balls.items()}
+
+
+def _in_frame(ball: Tensor) -> Tensor:
+    above, left = ((whole - SPHERE) // 2 for whole in FRAME)
+    below, right = FRAME[0] - SPHERE - above, FRAME[1] - SPHERE - left
+    return F.pad(ball, (0, 0, left, right, above, below))
+
+
+def tone_map(latlong_hdr: Latlong, convention: Convention) -> Float[Tensor, "b rows columns c"]:
+    """A map as a picture of 256 x 512: its own 99th percentile at 0.9, γ-2.4, clipped."""
+    reduced = reduce_map(latlong_hdr, LDR_ROWS, solid_angle=False)
+    return expose(reduced * auto_exposure(reduced), 0.0)
+
+
+def show_map(latlong: Latlong) -> dict[str, Lit]:
+    """The maps themselves, every pixel of them."""
+    return {"map": Lit(latlong, torch.ones(latlong.shape[1:3], dtype=torch.bool))}
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is compared of a pair of maps.
+
+    Attributes:
+        summary: one line for people.
+        parts: names of what is compared.
+        conditions: facts to report beside the convention's.
+        prepare: (a map, convention) -> the map as it is rendered.
+        render: prepared maps -> what is compared, by name.
+        conventions: keys of `CONVENTIONS` it is scored by.
+    """
+
+    summary: str
+    parts: tuple[str, ...]
+    conditions: Row
+    prepare: Callable[[Latlong, Convention], Latlong]
+    render: Callable[[Latlong], dict[str, Lit]]
+    conventions: tuple[str, ...] = ("published", "radiance")
+
+
+_SPHERES_SEEN: Final[Row] = {
+    "map_rows": MAP_ROWS,
+    "maps": "linear, or as published compressed: gamma 2.4, median of what is above 0 to 0.5",
+    "sphere_px": SPHERE,
+    "frame_px": list(FRAME),
+    "camera": "orthographic, from the front",
+}
+_MAPS_SEEN: Final[Row] = {"map_rows": LDR_ROWS, "maps": "tone-mapped: own 99th percentile to 0.9, gamma 2.4"}
+_THREE: Final = f"spheres ({', '.join(SPHERES)}) under the predicted and the true map"
+
+PROTOCOLS: Final[dict[str, Protocol]] = {
+    "three-spheres": Protocol(_THREE, SPHERES, _SPHERES_SEEN, prepare_map, render_three),
+    "random-camera": Protocol(
+        _THREE + ", photographed by any camera", SPHERES, _SPHERES_SEEN, prepare_map, render_three
+    ),
+    "ldr": Protocol("the maps themselves, each tone-mapped", ("map",), _MAPS_SEEN, tone_map, show_map),
+}
+"""Protocols by name."""
+
+
+def score_maps(
+    predicted_hdr: Latlong, truth_hdr: Float[Tensor, "b rows columns c"], name: str, convention: str
+) -> list[Row]:
+    """Errors of a map: one row for each sphere.
+
+    Args:
+        predicted_hdr: (1, H, 2H, 3) linear radiance.
+        truth_hdr: (1, H', 2H', 3) linear radiance; sizes may differ.
+        name: key of `PROTOCOLS`.
+        convention: one that the protocol takes.
+    """
+    protocol = PROTOCOLS[name]
+    maps = [protocol.prepare(latlong, CONVENTIONS[convention]) for latlong in (predicted_hdr, truth_hdr)]
+    rendered = protocol.render(torch.cat(maps))
+    return [
+        {"sphere": sphere, **asdict(picture_errors(lit.pictures[0], lit.pictures[1], lit.mask, convention))}
+        for sphere, lit in rendered.items()
+    ]
