@@ -42,6 +42,8 @@ __all__ = [
     "reduce_map",
     "render_three",
     "score_maps",
+    "show_map",
+    "tone_map",
 ]
 
 MAP_ROWS: Final = 128
