@@ -1,0 +1,350 @@
+"""Balls rendered by Blender's Cycles, the independent judge of `spheres` and of the perspective unwrap.
+
+    python -m dl_core.bench.blender perspective|spheres|array OUT [NAME ...]
+
+Needs `bpy` (extra `blender`), which wants numpy 1 and so an environment of its own. Nothing else of this package is
+imported: the judge shares no code with what it judges. Renders are written as linear half-float EXR, with a JSON file
+of the same name that holds what is in the picture.
+
+World: Blender's +X is right, +Z up, and the cameras look along +Y. That is our +X, +Y and -Z, so the centre column of a
+map lies straight ahead of a level camera, row 0 is up, and the right of the picture is right of the centre. Cycles puts
+the centre of an equirectangular map at +X with -Y right of it: maps are rolled by a quarter, an exact shift of pixels.
+
+Cycles reads the map bilinearly. All clamps, adaptive sampling, light-threshold and denoising are off, and the pixel
+filter is a box of one pixel, so that every render is an unbiased estimate of the mean radiance over each pixel; its
+variance is estimated from two renders with different seeds, of which the mean is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import bpy
+import numpy as np
+import OpenEXR
+
+__all__ = ["DIRECTION_MAP_HEIGHT", "direction_map", "main"]
+
+DIRECTION_MAP_HEIGHT: Final = 128
+_SHIPPED: Final = Path(__file__).parents[1] / "data" / "hdri"
+
+Pixels = np.ndarray
+"""(rows, columns, channels) float32, row 0 up."""
+
+
+# --- maps ---------------------------------------------------------------------------------------------------------
+
+
+def direction_map(height: int = DIRECTION_MAP_HEIGHT) -> Pixels:
+    """A map whose RGB is the direction: 1 + (x, y, z) / 2 in our axes, 0.5 to 1.5. Linear in direction, so that a
+    mean of colours is the mean of directions.
+    """
+    polar = (np.arange(height)[:, None] + 0.5) * (math.pi / height)
+    azimuth = ((np.arange(2 * height)[None, :] + 0.5) / height - 1) * math.pi
+    parts = (np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones_like(azimuth), -np.sin(polar) * np.cos(azimuth))
+    return (1 + np.stack(parts, axis=-1) / 2).astype(np.float32)
+
+
+def _uniform_map() -> Pixels:
+    return np.ones((64, 128, 3), np.float32)
+
+
+def _halved(pixels: Pixels) -> Pixels:
+    """Mean of 2 x 2 pixels, weighted by the solid angle of their rows."""
+    height = pixels.shape[0]
+    edges = np.cos(np.arange(height + 1) * (math.pi / height))
+    weights = (edges[:-1] - edges[1:]).reshape(-1, 2, 1, 1, 1)
+    blocks = pixels.reshape(height // 2, 2, height, 2, -1)
+    return ((blocks * weights).sum(axis=(1, 3)) / (2 * weights.sum(axis=1)[..., 0])).astype(np.float32)
+
+
+def _shipped_map(name: str, height: int) -> Pixels:
+    pixels = _read(_SHIPPED / f"{name}.exr")
+    while pixels.shape[0] > height:
+        pixels = _halved(pixels)
+    return pixels
+
+
+def environment(name: str, height: int) -> Pixels:
+    """The map of a name: `directions`, `uniform`, or a panorama shipped in data/hdri, halved down to a height."""
+    generated = {"directions": lambda: direction_map(height), "uniform": _uniform_map}
+    return generated[name]() if name in generated else _shipped_map(name, height)
+
+
+def _read(path: Path) -> Pixels:
+    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    return np.stack([channels[name].pixels.astype(np.float32) for name in "RGB"], axis=-1)
+
+
+def _write(path: Path, pixels: Pixels, dtype: type = np.float16) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    names = "RGBA"[: pixels.shape[-1]]
+    channels = {name: np.ascontiguousarray(pixels[..., index].astype(dtype)) for index, name in enumerate(names)}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+# --- scene --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Material:
+    """Inputs of Blender's Principled BSDF; all others stay at their defaults (IOR 1.5, specular level 0.5, white
+    tint), with the distribution Multiscatter GGX.
+    """
+
+    base: float
+    metallic: float
+    roughness: float
+
+
+MATERIALS: Final = {
+    "chrome": Material(base=1.0, metallic=1.0, roughness=0.0),
+    "mirror": Material(base=0.8, metallic=1.0, roughness=0.0),
+    "matte": Material(base=0.8, metallic=1.0, roughness=0.3271),
+    "diffuse": Material(base=0.8, metallic=0.0, roughness=0.364),
+    "lambert": Material(base=0.8, metallic=0.0, roughness=0.364),
+}
+"""The three spheres of the authors' evaluation; chrome, a mirror that absorbs nothing; lambert, a Diffuse BSDF of
+the base colour alone.
+"""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A pinhole camera and the part of its picture that is kept.
+
+    Attributes:
+        width: of the whole picture in pixels.
+        height: of the whole picture in pixels.
+        fov: horizontal field of view in degrees; 0 for an orthographic camera.
+        crop: left, top, width and height of the kept part in pixels.
+    """
+
+    width: int
+    height: int
+    fov: float
+    crop: tuple[int, int, int, int]
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return self.width / 2 / math.tan(math.radians(self.fov) / 2)
+
+
+def _empty_scene() -> Any:
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.render.threads_mode, scene.render.threads = "FIXED", 1
+    scene.render.film_transparent = True
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_mode = "RGBA"
+    scene.render.image_settings.color_depth = "32"
+    settings = scene.cycles
+    settings.device = "CPU"
+    settings.use_denoising = settings.use_adaptive_sampling = False
+    settings.sample_clamp_direct = settings.sample_clamp_indirect = 0
+    settings.light_sampling_threshold = settings.blur_glossy = 0
+    settings.pixel_filter_type = "BOX"
+    scene.render.filter_size = 1
+    settings.max_bounces = settings.diffuse_bounces = settings.glossy_bounces = 32
+    return scene
+
+
+def _light(scene: Any, pixels: Pixels, folder: Path) -> None:
+    """Make a map the world's light; importance sampling sees it at twice its own resolution."""
+    path = folder / "world.exr"
+    _write(path, np.roll(pixels, -pixels.shape[1] // 4, axis=1), np.float32)
+    world = scene.world = bpy.data.worlds.new("map")
+    world.use_nodes = True
+    nodes = world.node_tree.nodes
+    picture = nodes.new("ShaderNodeTexEnvironment")
+    picture.image = bpy.data.images.load(str(path))
+    picture.image.colorspace_settings.name = "Non-Color"
+    picture.interpolation = "Linear"
+    world.node_tree.links.new(picture.outputs["Color"], nodes["Background"].inputs["Color"])
+    world.cycles.sampling_method = "MANUAL"
+    world.cycles.sample_map_resolution = 2 * pixels.shape[1]
+
+
+def _principled(material: Material) -> Any:
+    shader = bpy.data.materials.new("ball")
+    shader.use_nodes = True
+    node = next(node for node in shader.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    node.distribution = "MULTI_GGX"
+    node.inputs["Base Color"].default_value = (*[material.base] * 3, 1)
+    node.inputs["Metallic"].default_value = material.metallic
+    node.inputs["Roughness"].default_value = material.roughness
+    return shader
+
+
+def _lambert(base: float) -> Any:
+    shader = bpy.data.materials.new("lambert")
+    shader.use_nodes = True
+    tree = shader.node_tree
+    node = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    node.inputs["Color"].default_value = (base, base, base, 1)
+    output = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL")
+    tree.links.new(node.outputs["BSDF"], output.inputs["Surface"])
+    return shader
+
+
+def _shader(name: str) -> Any:
+    material = MATERIALS[name]
+    return _lambert(material.base) if name == "lambert" else _principled(material)
+
+
+_SEGMENTS, _RINGS = 256, 128
+
+
+def _sphere_mesh(radius: float) -> Any:
+    """A closed sphere of 256 x 128 faces, 8e-5 of its radius from round at most, whose normals point from its centre.
+
+    An interpolated normal is then that of the point hit exactly: normals and corners are proportional.
+    """
+    polar = (np.arange(1, _RINGS) * (math.pi / _RINGS))[:, None]
+    azimuth = (np.arange(_SEGMENTS) * (2 * math.pi / _SEGMENTS))[None, :]
+    parts = (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar) * np.ones_like(azimuth))
+    corners = np.concatenate((np.stack(parts, axis=-1).reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]))
+    index = np.arange((_RINGS - 1) * _SEGMENTS).reshape(_RINGS - 1, _SEGMENTS)
+    after = np.roll(index, -1, axis=1)
+    quads = np.stack((index[:-1], index[1:], after[1:], after[:-1]), axis=-1).reshape(-1, 4).tolist()
+    north = [(len(corners) - 2, here, there) for here, there in zip(index[0], after[0], strict=True)]
+    south = [(len(corners) - 1, there, here) for here, there in zip(index[-1], after[-1], strict=True)]
+    mesh = bpy.data.meshes.new("sphere")
+    mesh.from_pydata((radius * corners).tolist(), [], quads + north + south)
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(mesh.polygons), bool))
+    mesh.normals_split_custom_set_from_vertices(corners.tolist())
+    return mesh
+
+
+def _sphere(scene: Any, shader: Any, centre: tuple[float, float, float], radius: float) -> None:
+    mesh = _sphere_mesh(radius)
+    mesh.materials.append(shader)
+    ball = bpy.data.objects.new("ball", mesh)
+    ball.location = centre
+    scene.collection.objects.link(ball)
+
+
+def _camera(scene: Any, frame: Frame, place: tuple[float, float, float], pitch: float, width: float = 0) -> None:
+    """A camera that looks along +Y, tilted by `pitch` degrees upwards; `width` is what an orthographic one sees."""
+    data = bpy.data.cameras.new("camera")
+    data.sensor_fit = "HORIZONTAL"
+    if frame.fov:
+        data.angle = math.radians(frame.fov)
+    else:
+        data.type, data.ortho_scale = "ORTHO", width
+    data.clip_start, data.clip_end = 1e-3, 1e4
+    camera = bpy.data.objects.new("camera", data)
+    camera.location = place
+    camera.rotation_euler = (math.radians(90 + pitch), 0, 0)
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    left, top, columns, rows = frame.crop
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = frame.width, frame.height, 100
+    render.use_border = render.use_crop_to_border = True
+    # Half a thousandth of a pixel inwards: the border is truncated to pixels.
+    render.border_min_x, render.border_max_x = (left + 5e-4) / frame.width, (left + columns + 5e-4) / frame.width
+    render.border_min_y = 1 - (top + rows - 5e-4) / frame.height
+    render.border_max_y = 1 - (top - 5e-4) / frame.height
+
+
+def _render(scene: Any, samples: int, seed: int, folder: Path) -> Pixels:
+    scene.cycles.samples, scene.cycles.seed = samples, seed
+    scene.render.filepath = str(folder / "render.exr")
+    bpy.ops.render.render(write_still=True)
+    channels = OpenEXR.File(scene.render.filepath, separate_channels=True).channels()
+    return np.stack([channels[name].pixels.astype(np.float32) for name in "RGBA"], axis=-1)
+
+
+def _noise(first: Pixels, second: Pixels) -> float:
+    """RMSE of the mean of two renders relative to their RMS where the ball covers the pixel: half their difference."""
+    inside = first[..., 3] > 0.999
+    difference = (first[..., :3] - second[..., :3])[inside] / 2
+    mean = (first[..., :3] + second[..., :3])[inside] / 2
+    return float(np.sqrt(np.mean(difference**2) / np.mean(mean**2)))
+
+
+def _save(path: Path, scene: Any, samples: int, facts: dict[str, Any]) -> None:
+    """Render twice and write the mean, premultiplied by coverage, and what is known about it."""
+    with tempfile.TemporaryDirectory() as folder:
+        first, second = (_render(scene, samples, seed, Path(folder)) for seed in (1, 2))
+    _write(path.with_suffix(".exr"), (first + second) / 2)
+    facts |= {"blender": bpy.app.version_string, "samples": 2 * samples, "seeds": [1, 2]}
+    facts["noise_relative_rms"] = _noise(first, second)
+    path.with_suffix(".json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+# --- perspective balls -------------------------------------------------------------------------------------------
+
+_BALL_RADIUS: Final = 128.0
+_FRAME: Final = 1024
+_MARGIN: Final = 8
+_ORIENTATION: Final = (
+    "our axes: +X right, +Y up, the camera looks along -Z; centre column of the map straight ahead, row 0 up, "
+    "right of the picture right of the centre"
+)
+
+
+def perspective(out: Path, environment_name: str, fov: float, samples: int = 64) -> None:
+    """A chrome ball at the centre of a square picture, its silhouette 128 px in radius."""
+    half = _FRAME // 2
+    side = int(_BALL_RADIUS) + _MARGIN
+    frame = Frame(_FRAME, _FRAME, fov, (half - side, half - side, 2 * side, 2 * side))
+    distance = math.hypot(frame.focal, _BALL_RADIUS) / _BALL_RADIUS  # sin of the silhouette's half angle is 1/distance
+    scene = _empty_scene()
+    with tempfile.TemporaryDirectory() as folder:
+        _light(scene, environment(environment_name, DIRECTION_MAP_HEIGHT), Path(folder))
+        _sphere(scene, _shader("chrome"), (0, distance, 0), 1)
+        _camera(scene, frame, (0, 0, 0), 0)
+        suffix = "" if environment_name == "directions" else f"_{environment_name}"
+        facts = {
+            "panorama": environment_name,
+            "panorama_height": DIRECTION_MAP_HEIGHT,
+            "colour": "1 + direction / 2" if environment_name == "directions" else "linear radiance",
+            "orientation": _ORIENTATION,
+            "fov_deg": fov,
+            "frame_px": [_FRAME, _FRAME],
+            "crop_px": dict(zip(("left", "top", "width", "height"), frame.crop, strict=True)),
+            "centre_in_frame_px": [half, half],
+            "centre_in_crop_px": [side, side],
+            "pixel_convention": "pixel (i, j) spans j to j + 1 across and i to i + 1 down",
+            "silhouette_radius_px": _BALL_RADIUS,
+            "focal_px": frame.focal,
+            "distance_in_radii": distance,
+            "material": asdict(MATERIALS["chrome"]),
+        }
+        _save(out / f"perspective_fov{fov:g}{suffix}", scene, samples // 2, facts)
+
+
+def _all_perspective(out: Path, names: list[str]) -> None:
+    for name in names or ["directions", "dancing_hall"]:
+        for fov in (40.0, 60.0, 90.0):
+            perspective(out, name, fov)
+
+
+SETS: Final[dict[str, Callable[[Path, list[str]], None]]] = {"perspective": _all_perspective}
+"""What can be rendered, by name: (folder, names of maps) -> files."""
+
+
+def main() -> None:
+    """Render a set of references into a folder."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("set", choices=tuple(SETS))
+    parser.add_argument("out", type=Path)
+    parser.add_argument("maps", nargs="*", help="names of maps; all of the set when none is given")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    SETS[args.set](args.out, args.maps)
+
+
+if __name__ == "__main__":
+    main()
