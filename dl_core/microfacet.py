@@ -40,8 +40,8 @@ from .errors import OptionError
 __all__ = ["Surface", "directional_albedo", "fresnel_dielectric", "fresnel_schlick", "mean_albedo"]
 
 _SMOOTH: Final = 0.03
-"""Roughness below which a surface is taken for a mirror; α is its square, and a lobe 0.1 degrees wide."""
-_NODES: Final = 96
+"""Roughness below which a surface is taken for a mirror: a lobe 0.1 degrees wide."""
+_NODES: Final = 64
 """Of the quadratures along each axis."""
 
 
@@ -73,28 +73,48 @@ def _lambda(cosine: Tensor, alpha: float) -> Tensor:
     return (torch.sqrt(1 + alpha**2 * (1 - squared) / squared) - 1) / 2
 
 
-def _seen_mirrors(cos_view: Tensor, alpha: float) -> tuple[Tensor, Tensor]:
-    """Cosines (v·h, n·l) of equally likely mirrors as seen from each view: (views, nodes).
+@dataclass(frozen=True)
+class _Mirrors:
+    """Mirrors a view sees: cosines v·h and n·l of (views, nodes), and how often each is seen (nodes)."""
 
-    Heitz 2018: stretch the view so that the surface is a hemisphere of roughness 1, and pick uniformly from its
-    projection. Midpoints of a polar grid take the place of random numbers.
+    between: Tensor
+    light: Tensor
+    share: Tensor
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean over the mirrors seen; those that reflect below the surface count 0."""
+        return (values * (self.light > 0)) @ self.share
+
+
+def _seen_mirrors(cos_view: Tensor, alpha: float) -> _Mirrors:
+    """Nodes of a quadrature over the mirrors seen from each view.
+
+    Heitz 2018: stretch the view so that the surface is a hemisphere of roughness 1, whose projection shows every mirror
+    as often as it is seen. Nodes are a polar grid over that disc, denser towards its edge, where GGX's long tail is.
     """
     steps = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES
-    radius, turn = torch.sqrt(steps)[:, None], (2 * math.pi * steps)[None, :]
+    radius, turn = torch.sqrt(1 - (1 - steps) ** 2)[:, None], (2 * math.pi * steps)[None, :]
+    share = ((1 - steps) * (2 / _NODES**2))[:, None].expand(-1, _NODES).flatten()
     first, second = (radius * torch.cos(turn)).flatten(), (radius * torch.sin(turn)).flatten()
     cos_v = cos_view.double()[:, None]
     sin_v = torch.sqrt(1 - cos_v**2)
     stretched = torch.hypot(alpha * sin_v, cos_v)
     sin_s, cos_s = alpha * sin_v / stretched, cos_v / stretched
-    share = (1 + cos_s) / 2
-    second = (1 - share) * torch.sqrt(1 - first**2) + share * second
+    lower = (1 + cos_s) / 2
+    second = (1 - lower) * torch.sqrt(1 - first**2) + lower * second
     third = torch.sqrt((1 - first**2 - second**2).clamp(min=0))
     along = -cos_s * second + sin_s * third
     up = sin_s * second + cos_s * third
     x, y = alpha * along, alpha * first
     length = torch.sqrt(x**2 + y**2 + up**2)
     cos_vh = (x * sin_v + up * cos_v) / length
-    return cos_vh, 2 * cos_vh * up / length - cos_v
+    return _Mirrors(cos_vh, 2 * cos_vh * up / length - cos_v, share)
+
+
+def _shown(cos_view: Tensor, cos_light: Tensor, alpha: float) -> Tensor:
+    """How much of a mirror that is seen is lit as well."""
+    seen, lit = _lambda(cos_view.double(), alpha)[:, None], _lambda(cos_light, alpha)
+    return (1 + seen) / (1 + seen + lit)
 
 
 def directional_albedo(cos_view: Float[Tensor, "n"], roughness: float) -> Float[Tensor, "n"]:
@@ -105,9 +125,8 @@ def directional_albedo(cos_view: Float[Tensor, "n"], roughness: float) -> Float[
         roughness: Blender's, above 0; its square is α.
     """
     alpha = roughness**2
-    _, cos_light = _seen_mirrors(cos_view, alpha)
-    seen, lit = _lambda(cos_view.double(), alpha)[:, None], _lambda(cos_light, alpha)
-    return ((1 + seen) / (1 + seen + lit) * (cos_light > 0)).mean(-1)
+    mirrors = _seen_mirrors(cos_view, alpha)
+    return mirrors.mean(_shown(cos_view, mirrors.light, alpha))
 
 
 @lru_cache(maxsize=64)
@@ -174,9 +193,9 @@ class Surface:
         if self.metallic:
             return torch.zeros_like(cos_view, dtype=torch.float64)
         normal = ((self.ior - 1) / (self.ior + 1)) ** 2
-        cos_vh, cos_light = _seen_mirrors(cos_view, self.roughness**2)
-        excess = (fresnel_dielectric(cos_vh, self.ior) - normal) / (1 - normal)
-        coat = normal + (1 - normal) * (excess * (cos_light > 0)).mean(-1)
+        mirrors = _seen_mirrors(cos_view, self.roughness**2)
+        excess = (fresnel_dielectric(mirrors.between, self.ior) - normal) / (1 - normal)
+        coat = normal + (1 - normal) * mirrors.mean(excess)
         return self.base * (1 - self._regained(cos_view)[1] * coat)
 
     def gloss(
@@ -201,9 +220,8 @@ class Surface:
     def gloss_albedo(self, cos_view: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         """The integral of `gloss` over all light: what is seen of it under uniform light, float64."""
         alpha = self.roughness**2
-        cos_vh, cos_light = _seen_mirrors(cos_view, alpha)
-        seen, lit = _lambda(cos_view.double(), alpha)[:, None], _lambda(cos_light, alpha)
-        once = (self.fresnel(cos_vh) * (1 + seen) / (1 + seen + lit) * (cos_light > 0)).mean(-1)
+        mirrors = _seen_mirrors(cos_view, alpha)
+        once = mirrors.mean(self.fresnel(mirrors.between) * _shown(cos_view, mirrors.light, alpha))
         return once * self._regained(cos_view)[0]
 
     def albedo(self, cos_view: Float[Tensor, "n"]) -> Float[Tensor, "n"]:

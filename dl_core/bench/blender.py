@@ -52,8 +52,18 @@ def direction_map(height: int = DIRECTION_MAP_HEIGHT) -> Pixels:
     return (1 + np.stack(parts, axis=-1) / 2).astype(np.float32)
 
 
-def _uniform_map() -> Pixels:
-    return np.ones((64, 128, 3), np.float32)
+def _uniform_map(height: int) -> Pixels:
+    return np.ones((height, 2 * height, 3), np.float32)
+
+
+def _sun_map(height: int) -> Pixels:
+    """A sun, exp(-(angle / 2 degrees)²) of radiance 1000, right above the camera's shoulder in a plain blue sky."""
+    towards = 2 * (direction_map(height).astype(np.float64) - 1)
+    sun = np.array([0.6, 0.48, 0.64])
+    angle = np.arccos(np.clip(towards @ sun / np.linalg.norm(towards, axis=-1), -1, 1))
+    glow = 1000 * np.exp(-((angle / math.radians(2)) ** 2))[..., None] * np.array([1.0, 0.9, 0.75])
+    sky = (1.2 + towards[..., 1:2]) * np.array([0.1, 0.14, 0.22])
+    return (glow + sky).astype(np.float32)
 
 
 def _halved(pixels: Pixels) -> Pixels:
@@ -73,9 +83,15 @@ def _shipped_map(name: str, height: int) -> Pixels:
 
 
 def environment(name: str, height: int) -> Pixels:
-    """The map of a name: `directions`, `uniform`, or a panorama shipped in data/hdri, halved down to a height."""
-    generated = {"directions": lambda: direction_map(height), "uniform": _uniform_map}
-    return generated[name]() if name in generated else _shipped_map(name, height)
+    """The map of a name: a generated one, or a panorama shipped in data/hdri, halved down to a height."""
+    return _GENERATED[name](height) if name in _GENERATED else _shipped_map(name, height)
+
+
+_GENERATED: Final[dict[str, Callable[[int], Pixels]]] = {
+    "directions": direction_map,
+    "sun": _sun_map,
+    "uniform": _uniform_map,
+}
 
 
 def _read(path: Path) -> Pixels:
@@ -331,7 +347,53 @@ def _all_perspective(out: Path, names: list[str]) -> None:
             perspective(out, name, fov)
 
 
-SETS: Final[dict[str, Callable[[Path, list[str]], None]]] = {"perspective": _all_perspective}
+# --- the authors' three spheres ------------------------------------------------------------------------------------
+
+_CAMERA: Final = (0.0, -16.0, 2.0)
+_FOV: Final = math.degrees(2 * math.atan(36 / 2 / 85))  # an 85 mm lens on a 36 mm sensor
+_SPHERE_SAMPLES: Final = {"diffuse": 128, "matte": 128, "mirror": 64}
+_PANORAMAS: Final = (
+    "apartment",
+    "dancing_hall",
+    "drachenfels_cellar",
+    "kloppenheim_05",
+    "narrow_moonlit_road",
+    "sun",
+    "uniform",
+)
+
+
+def three_spheres(out: Path, environment_name: str) -> None:
+    """The authors' spheres seen by their camera, which looks down at the sphere, in a third of their resolution."""
+    frame = Frame(320, 180, _FOV, (110, 40, 100, 100))
+    distance = math.hypot(*_CAMERA)
+    pitch = -math.degrees(math.atan2(_CAMERA[2], -_CAMERA[1]))
+    for name, samples in _SPHERE_SAMPLES.items():
+        scene = _empty_scene()
+        with tempfile.TemporaryDirectory() as folder:
+            _light(scene, environment(environment_name, DIRECTION_MAP_HEIGHT), Path(folder))
+            _sphere(scene, _shader(name), (0, 0, 0), 1)
+            _camera(scene, frame, _CAMERA, pitch)
+            facts = {
+                "panorama": environment_name,
+                "panorama_height": DIRECTION_MAP_HEIGHT,
+                "orientation": _ORIENTATION + ", but for the camera's pitch",
+                "pitch_deg": pitch,
+                "distance_in_radii": distance,
+                "frame_px": [frame.width, frame.height],
+                "crop_px": dict(zip(("left", "top", "width", "height"), frame.crop, strict=True)),
+                "silhouette_radius_px": frame.focal / math.sqrt(distance**2 - 1),
+                "material": asdict(MATERIALS[name]),
+            }
+            _save(out / f"{name}_{environment_name}", scene, samples // 2, facts)
+
+
+def _all_spheres(out: Path, names: list[str]) -> None:
+    for name in names or _PANORAMAS:
+        three_spheres(out, name)
+
+
+SETS: Final[dict[str, Callable[[Path, list[str]], None]]] = {"perspective": _all_perspective, "spheres": _all_spheres}
 """What can be rendered, by name: (folder, names of maps) -> files."""
 
 
