@@ -26,7 +26,7 @@ from typing import Final
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from .errors import OptionError
@@ -271,8 +271,7 @@ def _rings(around: Latlong, kernel: Tensor) -> Float[Tensor, "b rings azimuths c
     spectrum = torch.fft.rfft(around, dim=2)
     weights = kernel.to(around)
     parts = (_mixed(weights, spectrum.real), _mixed(weights, spectrum.imag))
-    mixed: Complex[Tensor, "b rings frequencies c"] = torch.complex(*parts)
-    return torch.fft.irfft(mixed, n=around.shape[2], dim=2)
+    return torch.fft.irfft(torch.complex(*parts), n=around.shape[2], dim=2)
 
 
 def _mixed(weights: Tensor, rows: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
-"""Spheres under a map: what a light probe does to a diffuse and to a mirror ball.
+"""Spheres under a map: what a light probe does to a diffuse, a matte and a mirror ball.
 
 The viewer is that of `geometry`: orthographic, at +Z, so that the sphere stands in the photograph like the painted
 ball. A mirror sphere is the map on a ball. A diffuse (Lambertian) one has radiance albedo / π · E(n), with the
-irradiance E(n) = ∫ L(l) max(0, n·l) dω.
+irradiance E(n) = ∫ L(l) max(0, n·l) dω. A matte one is rough silver (`microfacet`), as the authors evaluate with; their
+own camera and their diffuse sphere, which has a coat, are in `sphere_scene`.
 
 E is summed over light vectors, D = ∫ L l dω of a patch of the map: for a normal n that sees the whole patch,
 n·D is the patch's irradiance exactly, however its radiance is spread. Patches that straddle the horizon of n are the
@@ -30,7 +31,9 @@ from torch import Tensor
 from .errors import ImageError, OptionError
 from .exposure import auto_exposure, encode_display
 from .geometry import ball_coverage, latlong_to_ball
+from .microfacet import Surface
 from .shapes import BallImage, Image, Latlong
+from .sphere_scene import AUTHORS_SPHERES, View, render_sphere
 
 __all__ = ["ALBEDO", "MATERIALS", "gathered_irradiance", "render_spheres", "sphere_normals", "sphere_sheet"]
 
@@ -128,12 +131,23 @@ def _diffuse(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
     return _shade(latlong_hdr, size, albedo) * visible[..., None]
 
 
+def _matte(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
+    silver = Surface(base=albedo, metallic=True, roughness=AUTHORS_SPHERES["matte"].roughness)
+    return render_sphere(latlong_hdr, silver, View.square(size))
+
+
 def _mirror(latlong_hdr: Latlong, size: int, albedo: float) -> BallImage:
     return latlong_to_ball(latlong_hdr, size)
 
 
-MATERIALS: Final[dict[str, Callable[[Latlong, int, float], BallImage]]] = {"diffuse": _diffuse, "mirror": _mirror}
-"""Spheres by material: (map, size, albedo) -> radiance. A mirror reflects everything, whatever the albedo."""
+MATERIALS: Final[dict[str, Callable[[Latlong, int, float], BallImage]]] = {
+    "diffuse": _diffuse,
+    "matte": _matte,
+    "mirror": _mirror,
+}
+"""Spheres by material: (map, size, albedo) -> radiance. The albedo is a matte sphere's base colour, that is, what its
+mirrors reflect at right angles; a mirror reflects everything, whatever the albedo.
+"""
 
 
 def _require_albedo(albedo: float) -> None:
@@ -150,7 +164,7 @@ def render_spheres(
         latlong_hdr: (B, H, 2H, 3) linear radiance.
         size: side of each picture in pixels; the sphere fills it.
         materials: names of `MATERIALS`.
-        albedo: of the diffuse sphere, 0 to 1; 1 is ideal white.
+        albedo: of the diffuse and the matte sphere, 0 to 1; 1 is ideal white.
 
     Returns:
         By material, in the order asked for: (B, size, size, 3) linear radiance, zero off the sphere.

@@ -138,7 +138,7 @@ def test_a_furnace_shows_the_albedo(albedo: float) -> None:
     """In a uniform world a mirror is invisible and a diffuse sphere shows its albedo."""
     uniform = torch.full((1, 64, 128, 3), 3.0)
     spheres = render_spheres(uniform, 33, albedo=albedo)
-    assert list(spheres) == ["diffuse", "mirror"]
+    assert list(spheres) == ["diffuse", "matte", "mirror"]
     on_sphere = ball_coverage(33)[None] > 0
     assert_close(spheres["mirror"][on_sphere], 3.0)
     diffuse = spheres["diffuse"]
