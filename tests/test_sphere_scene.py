@@ -158,9 +158,23 @@ def test_there_is_a_render_of_every_sphere_under_six_panoramas() -> None:
         assert sum(stem.startswith(f"{name}_") and not stem.endswith("_uniform") for stem in RENDERS) >= 6
 
 
+def block_means(values: torch.Tensor, inside: torch.Tensor, side: int) -> torch.Tensor:
+    """Means over the pixels inside of blocks of side x side that are at least half inside."""
+    masked = (values * inside[..., None]).permute(2, 0, 1)[None]
+    share = torch.nn.functional.avg_pool2d(inside.float()[None, None], side)
+    means = torch.nn.functional.avg_pool2d(masked, side) / share.clamp(min=0.5)
+    return means[0, :, share[0, 0] >= 0.5]
+
+
 @pytest.mark.parametrize("stem", RENDERS)
 def test_spheres_agree_with_blender(stem: str) -> None:
-    """RMSE relative to the render's RMS, its own noise taken off in squares; a mirror inside 0.95 of its radius."""
+    """RMSE relative to the render's RMS, after the render's own noise; a mirror inside 0.95 of its radius.
+
+    Rough spheres are compared by means of 5 x 5 pixels of 94 across the ball, over which Blender's noise averages out
+    and an error of shading does not: independent noise shrinks by 5, and what is left is taken off in squares. A mirror
+    is compared pixel by pixel, clipped at the render's 99.9th percentile: its sun is smaller than a pixel, and a few
+    of 64 samples meet it.
+    """
     render, facts = reference(stem)
     name = stem.split("_", 1)[0]
     latlong = torch.from_numpy(environment(facts["panorama"], facts["panorama_height"]))[None]
@@ -171,8 +185,12 @@ def test_spheres_agree_with_blender(stem: str) -> None:
         facts["distance_in_radii"],
         elevation=-facts["pitch_deg"],
     )
-    inside = (render[..., 3] > 0.999) & shown_well_inside(view, 0.95 if name == "mirror" else 1.0)
-    expected = render[..., :3][inside]
-    error = render_sphere(latlong, AUTHORS_SPHERES[name], view)[0][inside] - expected
-    relative = float(error.square().mean() / expected.square().mean())
-    assert math.sqrt(max(0.0, relative - facts["noise_relative_rms"] ** 2)) < BARS[name]
+    side, ceiling, share = (1, 0.999, 0.95) if name == "mirror" else (5, 1.0, 1.0)
+    inside = (render[..., 3] > 0.999) & shown_well_inside(view, share)
+    limit = float(torch.quantile(render[..., :3][inside].flatten(), ceiling))
+    expected = render[..., :3].clamp(max=limit)
+    ours = render_sphere(latlong, AUTHORS_SPHERES[name], view)[0].clamp(max=limit)
+    error = block_means(ours - expected, inside, side).square().mean()
+    relative = float(error / block_means(expected, inside, side).square().mean())
+    noise = 0.0 if name == "mirror" else (facts["noise_relative_rms"] / side) ** 2
+    assert math.sqrt(max(0.0, relative - noise)) < BARS[name], math.sqrt(relative)
