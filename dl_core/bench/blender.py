@@ -46,7 +46,9 @@ def _read_rgba(path: str) -> Pixels:
 def _write(path: Path, pixels: Pixels, dtype: type = np.float16) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     names = "RGBA"[: pixels.shape[-1]]
-    channels = {name: np.ascontiguousarray(pixels[..., index].astype(dtype)) for index, name in enumerate(names)}
+    channels: dict[str, Any] = {
+        name: np.ascontiguousarray(pixels[..., index].astype(dtype)) for index, name in enumerate(names)
+    }
     OpenEXR.File(header, channels).write(str(path))
 
 
