@@ -30,7 +30,7 @@ from torch import Tensor
 
 from .errors import OptionError
 from .footprints import Footprints, coverage, spherical, unwrap
-from .projection import ORTHOGRAPHIC, Lens, Projection, disc_coordinates, disc_directions
+from .projection import ORTHOGRAPHIC, Lens, Projection, disc_directions
 from .shapes import BallImage, Directions, Image, Latlong, Mask
 
 __all__ = [
@@ -39,8 +39,6 @@ __all__ = [
     "ball_solid_angle",
     "ball_to_latlong",
     "camera_rotation",
-    "disc_coordinates",
-    "disc_directions",
     "latlong_coordinates",
     "latlong_coverage",
     "latlong_directions",

@@ -20,8 +20,6 @@ from dl_core.geometry import (
     ball_solid_angle,
     ball_to_latlong,
     camera_rotation,
-    disc_coordinates,
-    disc_directions,
     latlong_coordinates,
     latlong_directions,
     latlong_energy,
@@ -32,6 +30,7 @@ from dl_core.geometry import (
     sample_latlong,
 )
 from dl_core.imageio import read_envmap
+from dl_core.projection import disc_coordinates, disc_directions
 
 SHIPPED = sorted((Path(dl_core.__file__).parent / "data" / "hdri").glob("*.exr"))
 RIGHT, UP, AHEAD, BEHIND = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 1.0)

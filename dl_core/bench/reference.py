@@ -25,7 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..exposure import merge_paper, quantize
-from ..geometry import disc_coordinates
+from ..projection import disc_coordinates
 from ..shapes import BallImage, Latlong
 
 __all__ = ["reference_merge", "reference_unwrap"]

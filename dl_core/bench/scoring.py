@@ -18,23 +18,20 @@ from typing import Final
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..exposure import GAMMA, auto_exposure, expose
-from ..geometry import ball_coverage
 from ..picture_errors import CONVENTIONS, Convention, picture_errors
 from ..shapes import Latlong
-from ..spheres import MATERIALS, render_spheres
+from ..sphere_scene import AUTHORS_SPHERES, AUTHORS_VIEW, render_sphere, view_coverage
 from .report import Row
 
 __all__ = [
-    "FRAME",
     "MAP_ROWS",
     "PROTOCOLS",
-    "SPHERE",
     "SPHERES",
+    "VIEW",
     "Lit",
     "Protocol",
     "compress",
@@ -50,13 +47,10 @@ MAP_ROWS: Final = 128
 """Rows that maps are reduced to before anything is lit by them."""
 LDR_ROWS: Final = 256
 """Rows of the maps that are compared as pictures."""
-SPHERE: Final = 128
-"""Diameter of a rendered sphere in pixels."""
-FRAME: Final = (247, 439)
-"""Rows and columns of the frame a sphere is centred in: it covers the share it has in the public renders, 280 pixels in
-540 x 960, which is what the percentiles of the published normalized RMSE are taken over."""
-SPHERES: Final = tuple(name for name in ("diffuse", "matte", "mirror") if name in MATERIALS)
-"""Spheres that are scored, as far as `spheres` can render them."""
+SPHERES: Final = tuple(AUTHORS_SPHERES)
+"""Spheres that are scored, by name."""
+VIEW: Final = AUTHORS_VIEW
+"""How they are seen."""
 
 
 # --- maps --------------------------------------------------------------------------------------------------------
@@ -119,16 +113,12 @@ class Lit:
 
 
 def render_three(latlong: Latlong) -> dict[str, Lit]:
-    """The spheres under a batch of maps, by name, seen from the front and centred in `FRAME`."""
-    mask = _in_frame((ball_coverage(SPHERE) > 0)[None, ..., None])[0, ..., 0]
-    balls = render_spheres(latlong, SPHERE, SPHERES)
-    return {name: Lit(_in_frame(ball), mask) for name, ball in balls.items()}
-
-
-def _in_frame(ball: Tensor) -> Tensor:
-    above, left = ((whole - SPHERE) // 2 for whole in FRAME)
-    below, right = FRAME[0] - SPHERE - above, FRAME[1] - SPHERE - left
-    return F.pad(ball, (0, 0, left, right, above, below))
+    """The authors' spheres under a batch of maps, by name, as their camera sees them, over black."""
+    coverage = view_coverage(VIEW)[..., None]
+    return {
+        name: Lit(render_sphere(latlong, surface, VIEW) * coverage, coverage[..., 0] > 0)
+        for name, surface in AUTHORS_SPHERES.items()
+    }
 
 
 def tone_map(latlong_hdr: Latlong, convention: Convention) -> Float[Tensor, "b rows columns c"]:
@@ -166,9 +156,8 @@ class Protocol:
 _SPHERES_SEEN: Final[Row] = {
     "map_rows": MAP_ROWS,
     "maps": "linear, or as published compressed: gamma 2.4, median of what is above 0 to 0.5",
-    "sphere_px": SPHERE,
-    "frame_px": list(FRAME),
-    "camera": "orthographic, from the front",
+    "surfaces": {name: asdict(surface) for name, surface in AUTHORS_SPHERES.items()},
+    "view": asdict(VIEW),
 }
 _MAPS_SEEN: Final[Row] = {"map_rows": LDR_ROWS, "maps": "tone-mapped: own 99th percentile to 0.9, gamma 2.4"}
 _THREE: Final = f"spheres ({', '.join(SPHERES)}) under the predicted and the true map"

@@ -38,8 +38,10 @@ __all__ = [
 
 _NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
 
-BLIND_FROM, BLIND_ABOVE = 770, 800
-"""Noise levels between which the share of balls shown as noise alone rises from 0 to 1. SDEdit starts below them."""
+BLIND_FROM = 770
+"""Noise level from which balls are shown as noise alone, ever more of them; SDEdit starts below it."""
+BLIND_ABOVE = 800
+"""Noise level from which all balls are."""
 
 OFF_BALL_WEIGHT = 0.3
 """Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""

@@ -17,13 +17,8 @@ from torch import Generator, Tensor
 
 from ..ball import Ball, crop_ball, place_ball
 from ..exposure import auto_exposure, expose
-from ..geometry import (
-    ball_coverage,
-    camera_rotation,
-    disc_directions,
-    latlong_to_perspective,
-    sample_latlong,
-)
+from ..geometry import ball_coverage, camera_rotation, latlong_to_perspective, sample_latlong
+from ..projection import disc_directions
 from ..prompts import DARK_PROMPT, NEGATIVE_PROMPT, PROMPT
 from ..shapes import BallImage, Image, Latlong
 
