@@ -64,7 +64,7 @@ def disc_coordinates(directions: Directions) -> Disc:
     transverse = torch.hypot(x, y)
     # sqrt((1 - z) / 2) loses its digits near the centre, transverse / sqrt(2 + 2z) near the rim.
     radius = torch.where(z > 0, transverse / torch.sqrt(2 + 2 * z.clamp(min=0)), torch.sqrt((1 - z).clamp(min=0) / 2))
-    on_axis = transverse == 0
+    on_axis = transverse < torch.finfo(transverse.dtype).tiny  # below it the quotient overflows
     scale = radius / torch.where(on_axis, torch.ones_like(transverse), transverse)
     return torch.stack((torch.where(on_axis, radius, scale * x), scale * y), dim=-1)
 

@@ -30,7 +30,7 @@ def traced(x: float, y: float, focal: float, centre: tuple[float, float], radius
     """
     toward = np.array([centre[0], centre[1], -focal])
     toward = toward / np.linalg.norm(toward)
-    sideways = np.array([-centre[1], centre[0], 0.0]) if any(centre) else np.array([0.0, 1.0, 0.0])
+    sideways = np.array([-centre[1], centre[0], 0.0]) if math.hypot(*centre) > 1e-9 else np.array([0.0, 1.0, 0.0])
     sideways = sideways / np.linalg.norm(sideways)
     # The outline is an ellipse; its shorter half-axis b obeys sin² = b² cos² / (f² + b²).
     size = radius * -toward[2] / math.hypot(focal, radius)
