@@ -72,7 +72,8 @@ def perfect(variant: Variant, shot: object) -> Painter:
 
 
 def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: Path) -> None:
-    out, said = tmp_path / "out", []
+    out = tmp_path / "out"
+    said: list[str] = []
     paintings = list(planned([panorama], "three-spheres", list(VARIANTS), 0))
     paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
     assert len(said) == len(VARIANTS)
@@ -86,7 +87,8 @@ def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: 
 
 
 def test_what_is_there_is_not_painted_again(panorama: Path, tmp_path: Path) -> None:
-    out, said = tmp_path / "out", []
+    out = tmp_path / "out"
+    said: list[str] = []
     paintings = list(planned([panorama], "three-spheres", ["base", "both"], 0))
     paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
     (out / "maps" / "base" / f"{paintings[0].shot}.exr").unlink()

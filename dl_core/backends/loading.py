@@ -36,8 +36,9 @@ class ModelFiles:
     @staticmethod
     def of(args: argparse.Namespace) -> ModelFiles:
         """From the options `--model`, `--controlnet` and `--lora`."""
-        given = (args.model, args.controlnet, args.lora)
-        return ModelFiles(*(None if name is None else Path(name) for name in given))
+        names = (args.model, args.controlnet, args.lora)
+        model, controlnet, lora = (None if name is None else Path(name) for name in names)
+        return ModelFiles(model, controlnet, lora)
 
 
 @dataclass(frozen=True)

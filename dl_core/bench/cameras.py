@@ -91,8 +91,8 @@ def random_camera(key: str, seed: int = 0) -> Camera:
         seed: of the whole draw.
     """
     draw = random.Random(f"{seed}/{key}")
-    tenths = [round(draw.uniform(*span), 1) for span in ((-180.0, 180.0), (-45.0, 45.0), (30.0, 150.0))]
-    return Camera(*tenths)
+    yaw, pitch, fov = (round(draw.uniform(*span), 1) for span in ((-180.0, 180.0), (-45.0, 45.0), (30.0, 150.0)))
+    return Camera(yaw, pitch, fov)
 
 
 CAMERAS: Final[dict[str, Callable[[str, int], Sequence[Camera]]]] = {

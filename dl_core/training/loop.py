@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,19 +55,18 @@ class Budget:
 
 
 @torch.no_grad()
-def average_weights(averages: list[Tensor], weights: list[Tensor], step: int, horizon: float = 0.998) -> None:
+def average_weights(averages: Sequence[Tensor], weights: Sequence[Tensor], step: int, horizon: float = 0.998) -> None:
     """Move exponential averages of weights towards the current ones; early steps are forgotten faster."""
     decay = min(horizon, (1 + step) / (10 + step))
-    torch._foreach_lerp_(averages, weights, 1 - decay)
+    torch._foreach_lerp_(tuple(averages), tuple(weights), 1 - decay)
 
 
-def _share_gradients(weights: list[Tensor]) -> None:
+def _share_gradients(weights: Sequence[Tensor]) -> None:
     """Give every process the mean of all processes' gradients; a weight its batch did not touch counts as zero."""
-    for weight in weights:
-        weight.grad = torch.zeros_like(weight) if weight.grad is None else weight.grad
-    shared = reduce(torch.cat([weight.grad.flatten() for weight in weights]), reduction="mean")
+    own = [torch.zeros_like(weight) if weight.grad is None else weight.grad for weight in weights]
+    shared = reduce(torch.cat([gradient.flatten() for gradient in own]), reduction="mean")
     for weight, mean in zip(weights, shared.split([weight.numel() for weight in weights]), strict=True):
-        weight.grad.copy_(mean.view_as(weight))
+        weight.grad = mean.view_as(weight)
 
 
 def train(
@@ -120,7 +119,7 @@ def train(
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
             step += 1
-            average_weights(list(averages.values()), weights, step)
+            average_weights(tuple(averages.values()), weights, step)
             if not processes.is_main_process:
                 continue
             losses.append(float(loss.detach()))
