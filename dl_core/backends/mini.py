@@ -3,8 +3,8 @@
 It is a laboratory animal and a preview. Estimates meant for production use SDXL.
 
 A folder holds `mini.json` (defaults of use), a CLIP tokenizer, and one fp16 safetensors file per network in the
-key layout of diffusers and transformers. Its numbers against SDXL's: UNet widths 64/128/128 (320/640/1280), one
-residual block and one transformer block a level (2; 0/2/10), text widths 32 + 32 (768 + 1280), the autoencoder in
+key layout of diffusers and transformers. Its numbers against SDXL's: UNet widths 64/64/128/128 (320/640/1280), one
+residual block a level (2) and one transformer block in the two inner ones (0/2/10), text widths 32 + 32 (768 + 1280), the autoencoder in
 TAESD's shape. Latents are 8 times smaller than the picture and have 4 channels, as SDXL's.
 """
 
@@ -44,12 +44,12 @@ MINI_FOLDER: Final = Path(__file__).resolve().parent.parent / "data" / "mini"
 
 _BLOCKS: Final[dict[str, Any]] = {
     "in_channels": 4,
-    "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
-    "block_out_channels": (64, 128, 128),
+    "down_block_types": ("DownBlock2D", "DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
+    "block_out_channels": (64, 64, 128, 128),
     "layers_per_block": 1,
     "transformer_layers_per_block": 1,
     # diffusers reads this as the number of heads: 64 channels a head, as in SDXL.
-    "attention_head_dim": (1, 2, 2),
+    "attention_head_dim": (1, 1, 2, 2),
     "cross_attention_dim": 64,
     "use_linear_projection": True,
     "addition_embed_type": "text_time",
@@ -59,7 +59,7 @@ _BLOCKS: Final[dict[str, Any]] = {
 UNET_CONFIG: Final[dict[str, Any]] = _BLOCKS | {
     "sample_size": 32,
     "out_channels": 4,
-    "up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D"),
+    "up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D", "UpBlock2D"),
 }
 CONTROLNET_CONFIG: Final[dict[str, Any]] = _BLOCKS | {"conditioning_embedding_out_channels": (16, 32, 96, 256)}
 TEXT_CONFIG: Final[dict[str, Any]] = {

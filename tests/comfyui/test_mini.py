@@ -95,7 +95,7 @@ def test_autoencoder(graph: Any, generator: torch.Generator) -> None:
     assert (graph.vae.decode(latents) - decoded).abs().max() < PIXELS
 
 
-LAYER = "down_blocks.1.attentions.0.transformer_blocks.0.attn1"
+LAYER = "down_blocks.2.attentions.0.transformer_blocks.0.attn1"
 NAMINGS: dict[str, Callable[[str, str], str]] = {
     "peft": lambda layer, half: f"unet.{LAYER}.{layer}.lora_{'A' if half == 'down' else 'B'}.weight",
     "peft with an adapter": lambda layer, half: (
