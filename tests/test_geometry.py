@@ -392,6 +392,17 @@ def test_the_background_of_a_painted_ball_does_not_light_the_map() -> None:
     assert float(error) < 0.02
 
 
+@pytest.mark.parametrize("direction", [(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.05, 0.998, 0.03), (1.0, 0.0, 0.0)])
+def test_a_single_pixel_lights_the_map_with_its_solid_angle_at_the_poles_too(direction: tuple[float, ...]) -> None:
+    towards = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    x, y = (64 * disc_coordinates(towards)).tolist()
+    ball = torch.zeros(1, 128, 128, 1)
+    ball[0, math.floor(64 - y), math.floor(64 + x)] = 1
+    energy = float(latlong_energy(ball_to_latlong(ball, 128)))
+    # Sinkhorn's iteration is stopped early; single pixels at the poles are the last to settle.
+    assert energy == pytest.approx(ball_solid_angle(64), rel=0.03)
+
+
 def test_a_ball_smaller_than_its_crop_leaves_the_rest_dark() -> None:
     ball = latlong_to_ball(torch.ones(1, 16, 32, 3), 64, radius=20.0)
     assert float(ball[0, 0].max()) == 0
