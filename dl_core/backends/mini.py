@@ -4,8 +4,8 @@ It is a laboratory animal and a preview. Estimates meant for production use SDXL
 
 A folder holds `mini.json` (defaults of use), a CLIP tokenizer, and one fp16 safetensors file per network in the
 key layout of diffusers and transformers. Its numbers against SDXL's: UNet widths 64/64/128/128 (320/640/1280), one
-residual block a level (2) and one transformer block in the two inner ones (0/2/10), text widths 32 + 32 (768 + 1280), the autoencoder in
-TAESD's shape. Latents are 8 times smaller than the picture and have 4 channels, as SDXL's.
+residual block a level (2), one transformer block in the two inner levels (0/2/10), text widths 32 + 32 (768 + 1280),
+the autoencoder in TAESD's shape. Latents are 8 times smaller than the picture and have 4 channels, as SDXL's.
 """
 
 from __future__ import annotations

@@ -10,10 +10,8 @@ Sources: DiffusionLight, Sec. 5.1 (three spheres), 5.2 (random camera) and 5.3 (
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -23,6 +21,7 @@ from torch import Tensor
 
 from ..exposure import GAMMA, auto_exposure, expose
 from ..picture_errors import CONVENTIONS, Convention, picture_errors
+from ..resize import resize_latlong
 from ..shapes import Latlong
 from ..sphere_scene import AUTHORS_SPHERES, AUTHORS_VIEW, render_sphere, view_coverage
 from .report import Row
@@ -36,7 +35,6 @@ __all__ = [
     "Protocol",
     "compress",
     "prepare_map",
-    "reduce_map",
     "render_three",
     "score_maps",
     "show_map",
@@ -56,30 +54,6 @@ VIEW: Final = AUTHORS_VIEW
 # --- maps --------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=16)
-def _shares(source: int, target: int, *, solid_angle: bool) -> Float[Tensor, "target source"]:
-    """How much of each target row (or column) each source row makes up; every line sums to 1."""
-    edges = [torch.linspace(0, math.pi, count + 1, dtype=torch.float64) for count in (source, target)]
-    low, high = (-torch.cos(edge) if solid_angle else edge for edge in edges)
-    overlap = torch.minimum(low[None, 1:], high[1:, None]) - torch.maximum(low[None, :-1], high[:-1, None])
-    return (overlap.clamp(min=0) / high.diff()[:, None]).float()
-
-
-def reduce_map(latlong: Latlong, height: int, *, solid_angle: bool) -> Float[Tensor, "b rows columns c"]:
-    """Average a map over the pixels of one of another size, exactly, whatever the two sizes are.
-
-    Args:
-        latlong: (B, H, 2H, C).
-        height: rows of the result.
-        solid_angle: weigh by solid angle, which keeps the energy of radiance; otherwise by area of the picture, as
-            tools for pictures do.
-    """
-    rows = _shares(latlong.shape[1], height, solid_angle=solid_angle)
-    columns = _shares(latlong.shape[2], 2 * height, solid_angle=False)
-    # One axis after the other: both at once would be a matrix of all pixels by all pixels.
-    return torch.einsum("sj,brjc->brsc", columns, torch.einsum("ri,bijc->brjc", rows, latlong))
-
-
 def compress(latlong_hdr: Latlong) -> Latlong:
     """Gamma-compress a map as the public evaluation does: γ-2.4, then the median of what is above 0 to 0.5, no clip.
 
@@ -92,7 +66,7 @@ def compress(latlong_hdr: Latlong) -> Latlong:
 
 def prepare_map(latlong_hdr: Latlong, convention: Convention) -> Float[Tensor, "b rows columns c"]:
     """A map as spheres are lit by it under a convention: (1, 128, 256, 3)."""
-    reduced = reduce_map(latlong_hdr, MAP_ROWS, solid_angle=not convention.compressed)
+    reduced = resize_latlong(latlong_hdr, MAP_ROWS, solid_angle=not convention.compressed)
     return compress(reduced) if convention.compressed else reduced
 
 
@@ -123,7 +97,7 @@ def render_three(latlong: Latlong) -> dict[str, Lit]:
 
 def tone_map(latlong_hdr: Latlong, convention: Convention) -> Float[Tensor, "b rows columns c"]:
     """A map as a picture of 256 x 512: its own 99th percentile at 0.9, γ-2.4, clipped."""
-    reduced = reduce_map(latlong_hdr, LDR_ROWS, solid_angle=False)
+    reduced = resize_latlong(latlong_hdr, LDR_ROWS, solid_angle=False)
     return expose(reduced * auto_exposure(reduced), 0.0)
 
 
