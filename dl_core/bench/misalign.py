@@ -191,7 +191,7 @@ MISALIGNMENTS: Final[dict[str, Misalignment]] = {
 
 
 def misaligned_bracket(
-    ball_hdr: BallImage, evs: Sequence[float], level: str, *, seed: int, other: BallImage | None = None
+    ball_hdr: BallImage, evs: Sequence[float], level: str, *, seed: int, other: Float[Tensor, "n e e k"] | None = None
 ) -> list[BallImage]:
     """The 8-bit pictures a painter whose exposures disagree would paint of a ball.
 
