@@ -14,8 +14,23 @@ from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 __all__ = ["BallToEquirect", "EquirectToBall"]
 
 
-def _camera_inputs() -> list[io.Input]:
-    """Widgets for how the camera sees the ball, the same on both nodes; appended, so that saved workflows load."""
+def _yaw_input(turned: str) -> io.Input:
+    return io.Float.Input(
+        "yaw",
+        default=0.0,
+        min=-360.0,
+        max=360.0,
+        step=1.0,
+        tooltip=f"Degrees that the world is turned to the right {turned}.",
+    )
+
+
+def _camera_inputs(frame: str) -> list[io.Input]:
+    """Widgets for how the camera sees the ball, the same on both nodes; appended, so that saved workflows load.
+
+    Args:
+        frame: tooltip of the width of the whole picture.
+    """
     return [
         io.Combo.Input(
             "projection",
@@ -32,6 +47,7 @@ def _camera_inputs() -> list[io.Input]:
             optional=True,
             tooltip="Degrees that the whole picture spans along its longer side; used by perspective.",
         ),
+        io.Float.Input("frame", default=4.0, min=1.0, max=64.0, step=0.1, optional=True, tooltip=frame),
     ]
 
 
@@ -51,14 +67,7 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                 io.Image.Input("image", tooltip="A ball, cut out; or whole canvas images, with the ball connected."),
                 BallSocket.Input("ball", optional=True, tooltip="Where the ball sits, to cut it out of canvas images."),
                 io.Int.Input("height", default=256, min=2, max=4096, tooltip="Rows of the map; it is twice as wide."),
-                io.Float.Input(
-                    "yaw",
-                    default=0.0,
-                    min=-360.0,
-                    max=360.0,
-                    step=1.0,
-                    tooltip="Degrees that the world is turned to the right on the map.",
-                ),
+                _yaw_input("on the map"),
                 io.Int.Input(
                     "samples",
                     default=1,
@@ -67,16 +76,9 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                     tooltip="Samples along each side of a ball pixel; the footprint of each pixel of the map is always "
                     "covered, so 1 is enough.",
                 ),
-                *_camera_inputs(),
-                io.Float.Input(
-                    "frame",
-                    default=4.0,
-                    min=1.0,
-                    max=64.0,
-                    step=0.1,
-                    optional=True,
-                    tooltip="Ball crops without a ball connected: how many ball diameters the whole picture is wide; "
-                    "used by perspective.",
+                *_camera_inputs(
+                    "Ball crops without a ball connected: how many ball diameters the whole picture is wide; "
+                    "used by perspective."
                 ),
             ],
             outputs=[
@@ -136,24 +138,8 @@ class EquirectToBall(io.ComfyNode):  # type: ignore[misc]
             inputs=[
                 io.Image.Input("latlong", tooltip="A map, twice as wide as high; normally linear radiance."),
                 io.Int.Input("diameter", default=256, min=8, max=4096, tooltip="Side of the ball's picture, pixels."),
-                io.Float.Input(
-                    "yaw",
-                    default=0.0,
-                    min=-360.0,
-                    max=360.0,
-                    step=1.0,
-                    tooltip="Degrees that the world is turned to the right before it is shown.",
-                ),
-                *_camera_inputs(),
-                io.Float.Input(
-                    "frame",
-                    default=4.0,
-                    min=1.0,
-                    max=64.0,
-                    step=0.1,
-                    optional=True,
-                    tooltip="How many ball diameters the whole picture is wide; used by perspective.",
-                ),
+                _yaw_input("before it is shown"),
+                *_camera_inputs("How many ball diameters the whole picture is wide; used by perspective."),
             ],
             outputs=[named_output(io.Image, "ball_image", "The ball, black around it, in the encoding of the map.")],
         )
