@@ -15,18 +15,15 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from statistics import fmean
 from typing import Final
 
 from ..errors import ImageError, OptionError, OutputError
 from ..imageio import read_envmap
 from .pairs import ERROR_COLUMNS, protocol
-from .report import Column, Report, Row, median_and_worst, panorama_files, prepare_output, publish
-from .scoring import PROTOCOLS, score_maps
+from .report import Column, Report, Row, panorama_files, prepare_output, publish
+from .scoring import PROTOCOLS, score_maps, summarize_errors
 
 __all__ = ["add_arguments", "pair_maps", "run"]
-
-_ERRORS: Final = ("rmse", "si_rmse", "angular_error_deg", "normalized_rmse")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -143,15 +140,11 @@ def _description(args: argparse.Namespace) -> Row:
 
 
 def _summarize(rows: list[Row], parts: tuple[str, ...]) -> list[Row]:
-    """Mean, median and worst over the maps for each sphere; the paper prints means."""
+    """Errors over the maps, a record for each sphere."""
     summary = []
     for sphere in parts:
         of_sphere = [row for row in rows if row["sphere"] == sphere]
-        line: Row = {"sphere": sphere, "panoramas": len(of_sphere)}
-        for key in _ERRORS:
-            line[key] = fmean(row[key] for row in of_sphere)
-            line |= median_and_worst(of_sphere, key)
-        summary.append(line)
+        summary.append({"sphere": sphere, "panoramas": len(of_sphere), **summarize_errors(of_sphere)})
     return summary
 
 

@@ -10,7 +10,6 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
-from statistics import fmean
 from typing import Final
 
 from ..backends.loading import ModelFiles
@@ -22,12 +21,10 @@ from .cameras import CAMERAS
 from .painters import PAINTERS, open_studio
 from .paintings import VARIANTS, Painting, paint_maps, planned
 from .published import PUBLISHED
-from .report import Column, Report, Row, median_and_worst, panorama_files, prepare_output, publish, table
-from .scoring import PROTOCOLS, score_maps
+from .report import Column, Report, Row, panorama_files, prepare_output, publish, table
+from .scoring import PROTOCOLS, score_maps, summarize_errors
 
 __all__ = ["add_arguments", "run"]
-
-_FIGURES: Final = ("rmse", "si_rmse", "angular_error_deg", "normalized_rmse")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,8 +87,7 @@ def _variants(text: str) -> list[str]:
 
 
 def _score(painting: Painting, args: argparse.Namespace) -> list[Row]:
-    path = args.out / "maps" / painting.variant / f"{painting.shot}.exr"
-    truth = read_envmap(args.out / "truth" / f"{painting.shot}.exr")
+    path, truth = painting.map_in(args.out), read_envmap(painting.truth_in(args.out))
     head = {
         "panorama": painting.panorama.stem,
         "shot": painting.shot,
@@ -116,23 +112,20 @@ def _description(args: argparse.Namespace, settings: Settings, chosen: Preset) -
         else "drawn for each panorama: fov 30 to 150, elevation -45 to 45, any azimuth",
         "scored": PROTOCOLS[args.protocol].summary,
         **PROTOCOLS[args.protocol].conditions,
-        "published": [asdict(row) for row in PUBLISHED if row.protocol == args.protocol],
+        "published": _published(args.protocol),
     }
 
 
 def _summarize(rows: list[Row]) -> list[Row]:
-    """Mean, median and worst for each variant and sphere; the paper prints means."""
+    """Errors over the maps, a record for each variant and sphere."""
     summary = []
     for variant in VARIANTS:
         for sphere in dict.fromkeys(row["sphere"] for row in rows):
             own = [row for row in rows if row["variant"] == variant and row["sphere"] == sphere]
             if not own:
                 continue
-            line: Row = {"method": VARIANTS[variant].label, "sphere": sphere, "maps": len(own)}
-            for key in _FIGURES:
-                line[key] = fmean(row[key] for row in own)
-                line |= median_and_worst(own, key)
-            summary.append(line)
+            head = {"method": VARIANTS[variant].label, "sphere": sphere, "maps": len(own)}
+            summary.append({**head, **summarize_errors(own)})
     return summary
 
 

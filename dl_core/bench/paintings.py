@@ -80,6 +80,18 @@ class Painting:
         """Name of the photograph, fit for a file."""
         return f"{self.panorama.stem}.{self.camera.name}"
 
+    def map_in(self, folder: Path) -> Path:
+        """File of the painted map in a run's folder."""
+        return folder / "maps" / self.variant / f"{self.shot}.exr"
+
+    def truth_in(self, folder: Path) -> Path:
+        """File of the true map, the same for every variant."""
+        return folder / "truth" / f"{self.shot}.exr"
+
+    def sheet_in(self, folder: Path) -> Path:
+        """File of the picture sheet."""
+        return folder / "sheets" / self.variant / f"{self.shot}.png"
+
 
 def planned(panoramas: Sequence[Path], protocol: str, variants: Sequence[str], seed: int) -> Iterator[Painting]:
     """Every map of a run, panorama by panorama, so that a run cut short has whole panoramas."""
@@ -115,8 +127,7 @@ def paint_maps(
     """
     _require_same_run(folder, {"preset": asdict(preset), "settings": asdict(settings)})
     for number, painting in enumerate(paintings, 1):
-        path = folder / "maps" / painting.variant / f"{painting.shot}.exr"
-        if path.is_file():
+        if painting.map_in(folder).is_file():
             continue
         shot = take(read_envmap(painting.panorama), painting.camera)
         variant = VARIANTS[painting.variant]
@@ -139,9 +150,7 @@ def _require_same_run(folder: Path, options: dict[str, Any]) -> None:
 
 def _keep(folder: Path, painting: Painting, shot: Shot, probe: Probe) -> None:
     """Write truth, sheet and map; the map last, for it says that the others are there."""
-    truth = folder / "truth" / f"{painting.shot}.exr"
-    sheet = folder / "sheets" / painting.variant / f"{painting.shot}.png"
-    path = folder / "maps" / painting.variant / f"{painting.shot}.exr"
+    truth, sheet, path = painting.truth_in(folder), painting.sheet_in(folder), painting.map_in(folder)
     for place in (truth, sheet, path):
         place.parent.mkdir(parents=True, exist_ok=True)
     write_exr(truth, shot.truth_hdr[0], metadata={})

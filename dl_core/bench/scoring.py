@@ -11,7 +11,8 @@ Sources: DiffusionLight, Sec. 5.1 (three spheres), 5.2 (random camera) and 5.3 (
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
+from statistics import fmean
 from typing import Final
 
 import numpy as np
@@ -20,11 +21,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..exposure import GAMMA, auto_exposure, expose
-from ..picture_errors import CONVENTIONS, Convention, picture_errors
+from ..picture_errors import CONVENTIONS, Convention, PictureErrors, picture_errors
 from ..resize import resize_latlong
 from ..shapes import Latlong
 from ..sphere_scene import AUTHORS_SPHERES, AUTHORS_VIEW, render_sphere, view_coverage
-from .report import Row
+from .report import Row, median_and_worst
 
 __all__ = [
     "MAP_ROWS",
@@ -38,6 +39,7 @@ __all__ = [
     "render_three",
     "score_maps",
     "show_map",
+    "summarize_errors",
     "tone_map",
 ]
 
@@ -164,3 +166,12 @@ def score_maps(
         {"sphere": sphere, **asdict(picture_errors(lit.pictures[0], lit.pictures[1], lit.mask, convention))}
         for sphere, lit in rendered.items()
     ]
+
+
+def summarize_errors(rows: list[Row]) -> Row:
+    """Mean, median and worst of each error over rows; the paper prints means."""
+    line: Row = {}
+    for key in (field.name for field in fields(PictureErrors)):
+        line[key] = fmean(row[key] for row in rows)
+        line |= median_and_worst(rows, key)
+    return line
