@@ -6,7 +6,9 @@ rim. Each cell reads the ball bilinearly at its middle, and a row of the matrix 
 that a uniform ball gives a uniform map. Under an equal-area projection the columns are balanced (Sinkhorn's
 iteration) until each ball pixel lights the map with the solid angle it reflects, so that any ball keeps its energy.
 
-The matrix depends on sizes, place and projection only; it is cached, and unwrapping is one sparse product.
+The matrix depends on sizes, place and projection only; it is cached, and unwrapping is one sparse product. A ball in
+the middle of its crop and straight ahead of its camera looks the same in both mirrors, left and right, up and down:
+then the matrix is that of a quarter of the map, and the quarters are read off the ball and its mirror images.
 
 Source: Sinkhorn and Knopp, Concerning nonnegative matrices and doubly stochastic matrices (1967).
 """
@@ -30,6 +32,8 @@ __all__ = ["Footprints", "coverage", "spherical", "unwrap"]
 
 CELL_COUNTS: Final = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Cells along a side of a map pixel; the largest serves the pixels that meet straight ahead."""
+BALANCE_SAMPLES: Final = 16
+"""Samples along a side of a pixel on the outline, to tell how much of it the ball covers."""
 SWEEPS: Final = 4
 """Of Sinkhorn's iteration: leaves the energy of a map within 0.1%."""
 CACHED_PIXELS: Final = 1 << 20
@@ -72,6 +76,20 @@ class Footprints:
         """The projection of this ball."""
         return self.projection.lens(self.radius, self.centre, self.size)
 
+    @property
+    def mirrors(self) -> tuple[tuple[int, ...], ...]:
+        """Mirror images of the ball, as axes (0 rows, 1 columns) to flip, under which its map is mirrored alike.
+
+        The first is the ball itself; what the matrix holds is the first part of the map, 1 / len(mirrors) of it.
+        """
+        ahead = self.lens.axis[:2] == (0.0, 0.0) and self.centre == (self.size / 2, self.size / 2)
+        return ((), (1,), (0,), (0, 1)) if ahead and self.height % 2 == 0 else ((),)
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """Rows and columns of the map, from its upper left corner, that the matrix holds."""
+        return (self.height // 2, self.height) if len(self.mirrors) > 1 else (self.height, 2 * self.height)
+
     def disc(self, columns: Tensor, rows: Tensor) -> Float[Tensor, "r c 2"]:
         """Disc points of a grid of pixel positions in the crop."""
         x = (columns - self.centre[0]) / self.radius
@@ -113,18 +131,30 @@ def unwrap(ball: BallImage, key: Footprints) -> Latlong:
     strips, used = (_cached_matrix if 2 * key.height**2 <= CACHED_PIXELS else _matrix)(key, ball.device)
     # Multiplied by 0, what is left out could still be NaN.
     used_only = torch.where(used[None, :, :, None], ball, torch.zeros_like(ball))
+    images = torch.stack([used_only.flip([axis + 1 for axis in axes]) for axes in key.mirrors])
     # The sparse product has no half precision.
-    dense = used_only.permute(1, 2, 0, 3).flatten(0, 1).flatten(1).to(torch.promote_types(ball.dtype, torch.float32))
+    dense = images.permute(2, 3, 0, 1, 4).flatten(0, 1).flatten(1).to(torch.promote_types(ball.dtype, torch.float32))
     rows = torch.cat([strip @ dense for strip in strips]).to(ball.dtype)
-    return rows.unflatten(1, (ball.shape[0], -1)).transpose(0, 1).unflatten(1, (key.height, -1))
+    parts = rows.unflatten(0, key.part).unflatten(2, (*images.shape[:2], -1)).permute(2, 3, 0, 1, 4)
+    return _join(parts, key)
+
+
+def _join(parts: Float[Tensor, "m b p q c"], key: Footprints) -> Latlong:
+    """The map, of the parts that its mirror images gave."""
+    if len(parts) == 1:
+        return parts[0]
+    turned = [part.flip([axis + 1 for axis in axes]) for part, axes in zip(parts, key.mirrors, strict=True)]
+    upper, lower = torch.cat(turned[:2], dim=2), torch.cat(turned[2:], dim=2)
+    return torch.cat((upper, lower), dim=1)
 
 
 @torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
 @torch.no_grad()
 def _matrix(key: Footprints, device: torch.device) -> tuple[tuple[_Rows, ...], Tensor]:
-    """The matrix of a whole map in strips of rows, and which ball pixels (size, size) it reads."""
-    rows = max(1, STRIP_PIXELS // (2 * key.height * key.samples**2))
-    raw = [_strip(key, first, min(rows, key.height - first)) for first in range(0, key.height, rows)]
+    """The matrix of `key.part` of a map in strips of rows, and which ball pixels (size, size) it reads."""
+    height, width = key.part
+    rows = max(1, STRIP_PIXELS // (width * key.samples**2))
+    raw = [_strip(key, first, min(rows, height - first)) for first in range(0, height, rows)]
     weights = _pixel_weights(key, raw)
     strips = []
     while raw:
@@ -162,13 +192,13 @@ def _pixel_weights(key: Footprints, strips: list[_Rows]) -> Float[Tensor, "k"]:
     Beside the rim a bilinear sample reaches past the ball, and rows leave those pixels out and share their weight
     among the rest; without balance that costs 1% of the energy of a scene bright straight ahead.
     """
-    covered = coverage(key.size, key.radius, key.centre, key.lens).flatten()
+    covered = coverage(key.size, key.radius, key.centre, key.lens, BALANCE_SAMPLES).flatten()
     weights = covered.clone()
     band = torch.arange(key.height + 1, dtype=torch.float64) * (math.pi / key.height)
     solid = (torch.cos(band).diff().neg() * (key.radius**2 / 4 * math.pi / key.height)).float()
     if key.lens.equal_area:
         for _ in range(SWEEPS):
-            weights = _sweep(weights, covered, strips, solid)
+            weights = _sweep(key, weights, covered, strips, solid)
     if key.painted:
         positions = torch.arange(key.size) + 0.5
         weights = weights * key.lens.on_ball(key.disc(positions, positions)).flatten()
@@ -176,15 +206,21 @@ def _pixel_weights(key: Footprints, strips: list[_Rows]) -> Float[Tensor, "k"]:
 
 
 def _sweep(
-    weights: Float[Tensor, "k"], covered: Float[Tensor, "k"], strips: list[_Rows], solid: Float[Tensor, "h"]
+    key: Footprints,
+    weights: Float[Tensor, "k"],
+    covered: Float[Tensor, "k"],
+    strips: list[_Rows],
+    solid: Float[Tensor, "h"],
 ) -> Float[Tensor, "k"]:
     """One sweep of Sinkhorn's iteration: rows to 1, then columns to what the ball covers of each pixel."""
     share = torch.zeros_like(weights)
-    pixels = solid.repeat_interleave(2 * len(solid)).split([len(strip.starts) for strip in strips])
+    height, width = key.part
+    pixels = solid[:height].repeat_interleave(width).split([len(strip.starts) for strip in strips])
     for strip, areas in zip(strips, pixels, strict=True):
         per_row = areas / (strip @ weights[:, None])[:, 0].clamp(min=1e-12)
         share.index_add_(0, strip.columns, strip.values * strip.spread(per_row))
-    share = share * weights
+    square = share.view(key.size, key.size)
+    share = sum((square.flip(axes) for axes in key.mirrors), torch.zeros_like(square)).flatten() * weights
     return torch.where(share > 0, weights * covered / share.clamp(min=1e-12), weights)
 
 
@@ -218,7 +254,7 @@ def _strip(key: Footprints, first: int, rows: int) -> _Rows:
     for kind in kinds.unique().tolist():
         pixels = torch.nonzero(kinds == kind).squeeze(1)
         kind_columns, kind_values = _bilinear_entries(
-            key, _cells(key, pixels + first * 2 * key.height, *divmod(kind, 128))
+            key, _cells(key, pixels + first * key.part[1], *divmod(kind, 128))
         )
         places = starts[pixels, None] + torch.arange(kind_columns.shape[1])
         columns[places], values[places] = kind_columns, kind_values
@@ -232,7 +268,7 @@ def _cell_counts(key: Footprints, first: int, rows: int) -> tuple[Int[Tensor, "n
     and 1 / (2 cos(β/2)) around it. (A ball seen in perspective differs by a few percent.)
     """
     angle = math.pi / key.height
-    azimuth = (torch.arange(2 * key.height) + 0.5) * angle - math.pi
+    azimuth = (torch.arange(key.part[1]) + 0.5) * angle - math.pi
     polar = ((torch.arange(first, first + rows) + 0.5) * angle)[:, None]
     ax, ay, az = key.lens.axis
     ahead = ax * torch.sin(azimuth) - az * torch.cos(azimuth)
@@ -253,8 +289,8 @@ def _cell_counts(key: Footprints, first: int, rows: int) -> tuple[Int[Tensor, "n
 
 def _cells(key: Footprints, pixels: Int[Tensor, "n"], across: int, down: int) -> Float[Tensor, "n cells 3"]:
     """Middles of a pixel's cells. Down a pixel they divide the height cos(polar), so that all are equal in area."""
-    row = torch.div(pixels, 2 * key.height, rounding_mode="floor")
-    column = pixels - row * 2 * key.height
+    row = torch.div(pixels, key.part[1], rounding_mode="floor")
+    column = pixels - row * key.part[1]
     part = (torch.arange(down) + 0.5) / down
     # cos a - cos b = 2 sin((a + b) / 2) sin((b - a) / 2): the middles keep their digits at the poles.
     top, bottom = (row[:, None] + 0.0) / key.height, (row[:, None] + 1.0) / key.height
