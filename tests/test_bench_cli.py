@@ -52,7 +52,10 @@ def test_out_receives_what_json_prints(panoramas: Path, tmp_path: Path, capsys: 
         "bench", "protocol", "options", "environment", "seeds", "evaluations", "seconds", "summary", "rows",
     }  # fmt: skip
     assert {"lightprobe", "python", "torch", "commit", "threads"} <= set(result["environment"])
-    assert (result["bench"], result["options"]) == ("geometry", {"balls": [32, 64]})
+    assert (result["bench"], result["options"]) == (
+        "geometry",
+        {"balls": [32, 64], "unwrap": ["footprint"], "space": ["linear"]},
+    )
     assert [(row["panorama"], row["ball_px"]) for row in result["rows"]] == [
         ("a", 32), ("a", 64), ("b", 32), ("b", 64),
     ]  # fmt: skip

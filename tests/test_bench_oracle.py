@@ -151,3 +151,19 @@ def test_round_trips_of_a_smooth_map_cost_nothing_much(panoramas: Path) -> None:
         assert record["ball_energy"] == pytest.approx(1, abs=2e-3)
         assert record["energy_kept"] == pytest.approx(1, abs=2e-3)
     assert large["ldr_rmse"] < small["ldr_rmse"]
+
+
+def test_spaces_trade_light_for_what_a_display_shows(panoramas: Path) -> None:
+    """Encoded means of bright and dark values are darker than linear ones (Jensen); split ones lie between."""
+    rows = geometry.bench_geometry([panoramas / "sun.exr"], balls=(64,), spaces=tuple(geometry.SPACES))
+    linear, encoded, split = rows
+    assert encoded["energy_kept"] < split["energy_kept"] < linear["energy_kept"] + 1e-4
+    assert linear["energy_kept"] == pytest.approx(1, abs=3e-3)  # as geometry keeps a light of one map pixel
+    assert linear["highlight_energy"] > encoded["highlight_energy"]
+
+
+def test_a_map_without_highlights_has_none_to_keep(tmp_path: Path) -> None:
+    write_exr(tmp_path / "grey.exr", torch.ones(16, 32, 3), metadata={})
+    rows = geometry.bench_geometry([tmp_path / "grey.exr"], balls=(32,))
+    assert rows[0]["highlight_energy"] is None  # the whole map lies at 0.9 on display
+    assert geometry.summarize(rows)[0]["highlight_energy"] is None
