@@ -25,7 +25,7 @@ from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .errors import OptionError
@@ -163,33 +163,73 @@ def sample_latlong(latlong: Latlong, directions: Float[Tensor, "*n 3"]) -> Float
     return _bilinear(_pad_sphere(latlong), u * width + 1, v * height + 1)
 
 
-def rotate_latlong(latlong: Latlong, rotation: Float[Tensor, "3 3"], *, samples: int = 2) -> Latlong:
-    """Turn the world: the light from direction d comes from `rotation @ d` afterwards."""
+def rotate_latlong(latlong: Latlong, rotation: Float[Tensor, "3 3"], *, samples: int | None = None) -> Latlong:
+    """Turn the world: the light from direction d comes from `rotation @ d` afterwards.
+
+    Args:
+        latlong: (B, H, 2H, C).
+        rotation: a rotation matrix.
+        samples: samples along each side of a pixel; when not given, as many as find every pixel of the map, which
+            are narrow at its poles.
+
+    Raises:
+        OptionError: a map that is not 2:1, or samples outside 1 to 64.
+    """
+    _require_latlong(latlong)
     height = latlong.shape[1]
-    inverse = rotation.to(latlong).T
+    turn = rotation.to(latlong)
 
-    def look_up(directions: Tensor) -> Tensor:
-        return sample_latlong(latlong, directions @ inverse.T)
+    def cells(pixels: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        row = torch.div(pixels, 2 * height, rounding_mode="floor")
+        step = _subpixels(1, count, latlong.device)
+        v = ((row[:, None] + step) / height)[:, :, None].expand(-1, -1, count)
+        u = (((pixels - row * 2 * height)[:, None] + step) / (2 * height))[:, None, :].expand(-1, count, -1)
+        return spherical(u, v).flatten(1, 2) @ turn, torch.sin(v * math.pi).flatten(1)
 
-    return _gather_latlong(look_up, height, samples, latlong.device)
+    return _average(latlong, cells, 2 * height**2, math.pi / height, samples).unflatten(1, (height, 2 * height))
 
 
-def _gather_latlong(look_up: Callable[[Tensor], Tensor], height: int, samples: int, device: torch.device) -> Latlong:
-    """Average `look_up(directions)` over each pixel of a map, weighted by solid angle. Row strips bound memory."""
-    _require_height(height)
-    _require_samples(samples)
-    rows_per_strip = max(1, (1 << 20) // (2 * height * samples * samples))
-    v = _subpixels(height, samples, device) / height
-    u = _subpixels(2 * height, samples, device) / (2 * height)
-    strips = []
-    for strip in v.split(rows_per_strip * samples):
-        directions = spherical(u[None, :].expand(len(strip), -1), strip[:, None].expand(-1, len(u)))
-        values = look_up(directions)
-        weights = torch.sin(strip * math.pi).view(1, -1, samples, 1, 1, 1).to(values)
-        blocks = values.reshape(values.shape[0], len(strip) // samples, samples, 2 * height, samples, values.shape[-1])
-        weighted = (blocks * weights).sum(dim=(2, 4))
-        strips.append(weighted / (weights.sum(dim=2).squeeze(2) * samples))
-    return torch.cat(strips, dim=1)
+def _average(
+    latlong: Latlong,
+    cells: Callable[[Tensor, int], tuple[Tensor, Tensor]],
+    pixels: int,
+    angle: float,
+    samples: int | None,
+) -> Float[Tensor, "b n c"]:
+    """Means of a map over the pixels of another picture.
+
+    Args:
+        latlong: the map.
+        cells: of some pixels (n,) and a count: (n, count², 3) directions spread over each pixel, of any length, and
+            (n, count²) weights.
+        pixels: how many the picture has.
+        angle: that a pixel of the picture spans, radians.
+        samples: count for every pixel; when not given, by what the map holds there.
+    """
+    every = torch.arange(pixels, device=latlong.device)
+    if samples is None:
+        counts = _sample_counts(cells(every, 1)[0][:, 0], latlong.shape[1], angle)
+    else:
+        _require_samples(samples)
+        counts = torch.full_like(every, samples)
+    means = latlong.new_empty(latlong.shape[0], pixels, latlong.shape[3])
+    for count in counts.unique().tolist():
+        for some in every[counts == count].split(max(1, (1 << 20) // count**2)):
+            directions, weights = cells(some, count)
+            share = (weights / weights.sum(dim=1, keepdim=True)).to(latlong)
+            means[:, some] = (sample_latlong(latlong, directions) * share[..., None]).sum(dim=2)
+    return means
+
+
+def _sample_counts(directions: Float[Tensor, "n 3"], height: int, angle: float) -> Int[Tensor, "n"]:
+    """Samples along a side of pixels that look at a map in these directions, as a power of 2: two to a map pixel.
+
+    What is narrowest counts: a map's pixel is sin(polar) as wide as it is high. At its own pole, where that goes to 0,
+    half a pixel of the picture is as near as its mean looks.
+    """
+    sine = torch.nn.functional.normalize(directions, dim=-1)[:, [0, 2]].norm(dim=-1).clamp(min=angle / 4)
+    wanted = 2 * angle * height / (math.pi * sine)
+    return 2 ** torch.log2(wanted.clamp(2, 64)).ceil().int()
 
 
 # --- mirror ball -------------------------------------------------------------------------------------------------
@@ -459,7 +499,7 @@ def latlong_to_perspective(
     *,
     fov: float = 60.0,
     rotation: Float[Tensor, "3 3"] | None = None,
-    samples: int = 2,
+    samples: int | None = None,
 ) -> Float[Tensor, "b rows columns c"]:
     """What a pinhole camera sees of a map.
 
@@ -469,21 +509,23 @@ def latlong_to_perspective(
         width: columns of the picture.
         fov: field of view across the longer side, degrees, 1 to 179.
         rotation: camera to world, as from `camera_rotation`; straight ahead when not given.
-        samples: samples along each side of a pixel.
+        samples: samples along each side of a pixel; when not given, as many as find every pixel of the map.
 
     Raises:
-        OptionError: field of view or samples out of range.
+        OptionError: a map that is not 2:1, field of view or samples out of range.
     """
     if not 1 <= fov <= 179:
         raise OptionError("fov", fov, "1 to 179 degrees")
-    _require_samples(samples)
+    _require_latlong(latlong)
     extent = math.tan(math.radians(fov) / 2) * 2 / max(height, width)
-    x = (_subpixels(width, samples, latlong.device) - width / 2) * extent
-    y = (height / 2 - _subpixels(height, samples, latlong.device)) * extent
-    across, up = torch.broadcast_tensors(x[None, :], y[:, None])
-    rays = torch.stack((across, up, -torch.ones_like(across)), dim=-1)
-    if rotation is not None:
-        rays = rays @ rotation.to(rays).T
-    values = sample_latlong(latlong, rays)
-    blocks = values.reshape(values.shape[0], height, samples, width, samples, values.shape[-1])
-    return blocks.mean(dim=(2, 4))
+    turn = (torch.eye(3) if rotation is None else rotation).to(latlong)
+
+    def cells(pixels: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        row = torch.div(pixels, width, rounding_mode="floor")
+        step = _subpixels(1, count, latlong.device)
+        x = ((pixels - row * width)[:, None, None] + step - width / 2).expand(-1, count, -1)
+        y = (height / 2 - row[:, None, None] - step[:, None]).expand(-1, -1, count)
+        rays = torch.stack((x * extent, y * extent, -torch.ones_like(x)), dim=-1).flatten(1, 2)
+        return rays @ turn.T, torch.ones_like(rays[..., 0])
+
+    return _average(latlong, cells, height * width, extent, samples).unflatten(1, (height, width))

@@ -162,6 +162,20 @@ def test_a_light_ahead_turns_with_the_world(rotation: torch.Tensor, u: float, v:
     assert found == pytest.approx((u, v), abs=0.6 / 64)
 
 
+@pytest.mark.parametrize("polar", [0.0, 0.3, 2.0, 10.0, 90.0])
+def test_a_lone_pixel_keeps_its_light_wherever_it_turns(polar: float) -> None:
+    """Narrow pixels near the poles are found by the wide ones that they turn into."""
+    height = 64
+    row = min(height - 1, int(polar / 180 * height))
+    latlong = torch.zeros(1, height, 2 * height, 1)
+    latlong[0, row, 20] = 100.0
+    fine = sample_latlong(latlong, latlong_directions(32 * height))
+    light = latlong_energy(fine)  # of the interpolated map, 32 samples to a pixel
+    turned = rotate_latlong(latlong, camera_rotation(pitch=90.0) @ camera_rotation(yaw=30.0))
+    # Two samples a pixel, a tent a pixel wide on each side: the midpoint rule errs by at most (1/2)² / 8 = 3%.
+    assert float(latlong_energy(turned) / light) == pytest.approx(1, abs=0.03)
+
+
 def test_roll_turns_the_camera_clockwise() -> None:
     # Turned clockwise by a quarter, the camera's right side points at the ground.
     assert_close(camera_rotation(roll=90.0) @ torch.tensor(RIGHT), torch.tensor([0.0, -1.0, 0.0]))
@@ -426,6 +440,16 @@ def test_perspective_sees_the_closed_form(height: int, width: int, fov: float) -
     expected = torch.nn.functional.normalize(rays @ rotation.T, dim=-1)
     # Bilinear between directions π/256 apart: the chord's sagitta is (π/256)²/8 = 2e-5 an axis.
     torch.testing.assert_close(picture[0], expected, rtol=0, atol=6e-5)
+
+
+def test_a_small_picture_of_a_large_map_shows_its_mean() -> None:
+    """Every pixel of the map counts: noise comes out as its mean, as far as the number of pixels averages it."""
+    noise = torch.rand(1, 256, 512, 1, generator=torch.Generator().manual_seed(0))
+    picture = latlong_to_perspective(noise, 6, 8, fov=90.0)
+    # A pixel of the picture spans at least 22 x 22 of the map's at 256 / π rad: deviation 0.29 / 22, six of them.
+    assert float((picture - 0.5).abs().max()) < 6 * 0.29 / 22
+    point_samples = latlong_to_perspective(noise, 6, 8, fov=90.0, samples=1)
+    assert float((point_samples - 0.5).abs().max()) > 6 * 0.29 / 22
 
 
 @pytest.mark.parametrize(

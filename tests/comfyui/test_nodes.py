@@ -378,3 +378,24 @@ def test_yaw_turns_the_world_to_the_right(node: Nodes) -> None:
 def test_oblong_ball_is_refused(node: Nodes) -> None:
     with pytest.raises(errors().ImageError, match="image: is 8 x 4 pixels; a square ball crop"):
         node("BallToEquirect").execute(torch.rand(1, 4, 8, 3), height=8, yaw=0.0, samples=1)
+
+
+def smooth_latlong(height: int = 64) -> torch.Tensor:
+    return torch.exp(pack_module("dl_core.geometry").latlong_directions(height))[None]
+
+
+@pytest.mark.parametrize("camera", [{}, {"projection": "perspective", "fov": 60.0, "frame": 4.0}])
+def test_a_map_comes_back_from_the_ball_it_shows(node: Nodes, camera: dict[str, Any]) -> None:
+    latlong = smooth_latlong()
+    (ball,) = node("EquirectToBall").execute(latlong, 256, 90.0, **camera).args
+    assert ball.shape == (1, 256, 256, 3)
+    again, coverage = node("BallToEquirect").execute(ball, height=64, yaw=-90.0, samples=1, **camera).args
+    seen = coverage > 0.99
+    # exp(d) changes by at most e · π/64 = 13% a pixel of the map; a pixel of the ball blurs by a fraction of that.
+    torch.testing.assert_close(again[seen], latlong[seen], rtol=0.02, atol=0.02)
+    assert float(seen.float().mean()) > 0.9
+
+
+def test_a_map_of_another_shape_is_named(node: Nodes) -> None:
+    with pytest.raises(errors().OptionError, match="latlong"):
+        node("EquirectToBall").execute(torch.rand(1, 16, 16, 3), 64, 0.0)
