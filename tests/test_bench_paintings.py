@@ -75,7 +75,7 @@ def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: 
     out = tmp_path / "out"
     said: list[str] = []
     paintings = list(planned([panorama], "three-spheres", list(VARIANTS), 0))
-    paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
+    paint_maps(paintings, perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
     assert len(said) == len(VARIANTS)
     truth = read_envmap(out / "truth" / f"{paintings[0].shot}.exr")
     light = {name: read_envmap(out / "maps" / name / f"{paintings[0].shot}.exr") for name in VARIANTS}
@@ -90,17 +90,22 @@ def test_what_is_there_is_not_painted_again(panorama: Path, tmp_path: Path) -> N
     out = tmp_path / "out"
     said: list[str] = []
     paintings = list(planned([panorama], "three-spheres", ["base", "both"], 0))
-    paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
+    paint_maps(paintings, perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
     (out / "maps" / "base" / f"{paintings[0].shot}.exr").unlink()
-    paint_maps(paintings, perfect, PRESET, SETTINGS, out, report=said.append)
+    paint_maps(paintings, perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
     assert len(said) == 3
     assert "base:" in said[-1]
 
 
-def test_a_folder_of_another_run_is_refused(panorama: Path, tmp_path: Path) -> None:
-    paint_maps([], perfect, PRESET, SETTINGS, tmp_path / "out", report=lambda line: None)
+@pytest.mark.parametrize(("painter", "seed"), [("perfect", 1), ("mini", SETTINGS.seed)])
+def test_a_folder_of_another_run_is_refused(painter: str, seed: int, tmp_path: Path) -> None:
+    def begin(painter: str, seed: int) -> None:
+        settings = replace(SETTINGS, seed=seed)
+        paint_maps([], perfect, PRESET, settings, tmp_path / "out", painter=painter, report=lambda line: None)
+
+    begin("perfect", SETTINGS.seed)
     with pytest.raises(OptionError, match="--out"):
-        paint_maps([], perfect, PRESET, replace(SETTINGS, seed=1), tmp_path / "out", report=lambda line: None)
+        begin(painter, seed)
 
 
 def test_every_photograph_of_a_run_has_its_own_name(panorama: Path) -> None:

@@ -6,6 +6,7 @@ The paper's ablation rows are variants of one run; its printed figures stand bel
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
 import time
 from dataclasses import asdict
@@ -53,9 +54,12 @@ def run(args: argparse.Namespace) -> int:
     chosen = preset(args.preset)
     prepare_output(args)
     started = time.perf_counter()
-    studio = open_studio(args.painter, ModelFiles.of(args))
+    files = ModelFiles.of(args)
+    studio = open_studio(args.painter, files)
     settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
-    paint_maps(paintings, studio.painter_of, chosen, settings, args.out, report=_say)
+    paint_maps(
+        paintings, studio.painter_of, chosen, settings, args.out, painter=_identity(args.painter, files), report=_say
+    )
     rows = [row for painting in paintings for row in _score(painting, args)]
     report = Report(
         f"protocol {args.protocol}",
@@ -72,6 +76,15 @@ def run(args: argparse.Namespace) -> int:
             "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
         )
     return 0
+
+
+def _identity(painter: str, files: ModelFiles) -> str:
+    """Name of a painter with a fingerprint of where its files lie: the folders themselves are nobody else's affair."""
+    places = (files.model, files.controlnet, files.lora)
+    if not any(places):
+        return painter
+    text = "\n".join("" if place is None else str(place.resolve()) for place in places)
+    return f"{painter} {hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 def _say(line: str) -> None:

@@ -107,6 +107,7 @@ def paint_maps(
     settings: Settings,
     folder: Path,
     *,
+    painter: str,
     observer: Observer | None = None,
     report: Callable[[str], None],
 ) -> None:
@@ -115,6 +116,7 @@ def paint_maps(
     Args:
         paintings: what to paint.
         painter_of: gives the painter.
+        painter: what tells it from other painters; a folder holds maps of one.
         preset: schedule and bracket of the full method.
         settings: all else: canvas, ball, merge, seed, rows of the map.
         folder: of the run.
@@ -122,10 +124,10 @@ def paint_maps(
         report: told of each map, once it is written.
 
     Raises:
-        OptionError: the folder holds a run with other settings.
+        OptionError: the folder holds a run with other settings or of another painter.
         OutputError: the folder cannot be written.
     """
-    _require_same_run(folder, {"preset": asdict(preset), "settings": asdict(settings)})
+    _require_same_run(folder, {"painter": painter, "preset": asdict(preset), "settings": asdict(settings)})
     for number, painting in enumerate(paintings, 1):
         if painting.map_in(folder).is_file():
             continue
