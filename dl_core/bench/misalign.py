@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..errors import ImageError, OptionError
@@ -82,7 +83,13 @@ def displace(ball: BallImage, offsets: Float[Tensor, "1 2 d d"] | Float[Tensor, 
     grid = (source * (2 / size)).permute(0, 2, 3, 1).to(ball)
     planes = ball.permute(0, 3, 1, 2)
     moved = F.grid_sample(planes, grid.expand(len(ball), -1, -1, -1), mode="bilinear", align_corners=False)
-    return moved.permute(0, 2, 3, 1) * (ball_coverage(size).to(ball) > 0)[None, :, :, None]
+    return moved.permute(0, 2, 3, 1) * _touched(size).to(ball)[None, :, :, None]
+
+
+@lru_cache(maxsize=4)
+def _touched(size: int) -> Bool[Tensor, "d d"]:
+    """Pixels of a crop that the ball covers any part of."""
+    return ball_coverage(size) > 0
 
 
 def _shift(pixels: float) -> Scene:
