@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -24,14 +23,13 @@ __all__ = [
     "GAMMA",
     "LUMINANCE",
     "MERGES",
-    "Agreement",
     "auto_exposure",
     "check_evs",
     "check_merge",
-    "compare_exposures",
     "decode_display",
     "encode_display",
     "expose",
+    "exposure_error",
     "luminance",
     "merge_bracket",
     "merge_channel",
@@ -56,9 +54,9 @@ DEAD_ZONE: Final = 0.05
 LARGEST_ERROR: Final = 2.0
 """Stops of error that are undone at most: two neighbours, each off by one. More is another scene."""
 TRUST: Final = 0.5
-"""Scatter in stops, a median absolute deviation, up to which a darker exposure's colour is used in full."""
+"""Scatter in stops, a median absolute deviation, up to which a measured error is believed in full."""
 DISTRUST: Final = 1.0
-"""Scatter in stops from which it is not used at all."""
+"""Scatter in stops from which it is not believed at all."""
 
 
 def encode_display(radiance: Tensor, gamma: float = GAMMA) -> Tensor:
@@ -149,28 +147,15 @@ def _ramp(exposed: Tensor) -> Tensor:
     return ((exposed - CLIP_THRESHOLD) / (1 - CLIP_THRESHOLD)).clamp(0, 1)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How an exposure and the next darker one agree on what both can show.
-
-    Attributes:
-        stops: by which the darker one is brighter than its EV says; 0 without evidence.
-        trust: in its colour, 0 to 1; 1 without evidence.
-    """
-
-    stops: float = 0.0
-    trust: float = 1.0
-
-
-def compare_exposures(
+def exposure_error(
     brighter: Float[Tensor, "*n 3"], darker: Float[Tensor, "*n 3"], stops: float, gamma: float = GAMMA
-) -> Agreement:
-    """Measure an exposure against the next brighter one.
+) -> float:
+    """Stops by which an exposure is brighter than its EV says, measured against the next brighter one.
 
     Compared are values that the brighter one shows below clipping and the darker one must show clear of its coarsest
-    codes. Their median ratio is the error of the darker one's EV. Their scatter about it says whether both are
-    pictures of one scene: it is taken over values beside a clipped channel, where the colour of a light is at stake,
-    and over all of them where those are few. An error that no exposure has, above 2 stops, counts like scatter.
+    codes. Their median ratio is the error. Their scatter about it says whether both are pictures of one scene, and so
+    how far the ratio is to be believed. An error that no exposure has, above 2 stops, counts like scatter. What
+    rounding and scatter may feign is left out, so that exposures that agree have an error of exactly 0.
 
     Args:
         brighter: linear values in [0, 1] of its own white.
@@ -178,73 +163,63 @@ def compare_exposures(
         stops: between the two, above 0, as the EVs say.
         gamma: of the display encoding they were painted in.
 
-    Source: Mitsunaga and Nayar, Radiometric self calibration (CVPR 1999), Sec. 3.4, for exposure ratios measured from
-    the pictures; Grosch, Fast and robust high dynamic range image generation with camera and object movement (VMV
-    2006), for finding ghosts by predicting one exposure from another.
+    Returns:
+        Within -2 to 2; 0 for fewer than 100 values to compare.
+
+    Source: Mitsunaga and Nayar, Radiometric self calibration (CVPR 1999), for exposure ratios measured from the
+    pictures.
     """
     floor = max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
     known = (brighter >= floor) & (brighter < CLIP_THRESHOLD)
-    beside = known & (brighter.amax(dim=-1, keepdim=True) >= CLIP_THRESHOLD)
-    ratio = torch.log2(darker.clamp(min=1e-6) / brighter.clamp(min=1e-6)) + stops
-    offset, scatter = _centre_and_scatter(ratio[known])
-    if int(beside.sum()) >= EVIDENCE_COUNT:
-        scatter = max(scatter, _centre_and_scatter(ratio[beside])[1])
-    doubt = scatter + max(0.0, abs(offset) - LARGEST_ERROR)
+    if int(known.sum()) < EVIDENCE_COUNT:
+        return 0.0
+    ratios = torch.log2(darker[known].clamp(min=1e-6) / brighter[known]) + stops
+    error = float(ratios.median())
+    scatter = float((ratios - error).abs().median())
+    doubt = scatter + max(0.0, abs(error) - LARGEST_ERROR)
     trust = min(1.0, max(0.0, (DISTRUST - doubt) / (DISTRUST - TRUST)))
-    excess = min(max(abs(offset) - scatter - DEAD_ZONE, 0.0), LARGEST_ERROR)
-    return Agreement(math.copysign(excess, offset) * trust, trust)
-
-
-def _centre_and_scatter(ratios: Float[Tensor, "n"]) -> tuple[float, float]:
-    """Median, and median absolute deviation from it; both 0 for too few values to say."""
-    if len(ratios) < EVIDENCE_COUNT:
-        return 0.0, 0.0
-    centre = ratios.median()
-    return float(centre), float((ratios - centre).abs().median())
+    excess = min(max(abs(error) - scatter - DEAD_ZONE, 0.0), LARGEST_ERROR)
+    return math.copysign(excess, error) * trust
 
 
 def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:
-    """Merge by channel as far as the exposures agree, by luminance as far as they do not.
+    """Merge each colour channel by itself, once each exposure's error is undone.
 
-    Each darker exposure is compared with the next brighter one (`compare_exposures`): its error of exposure is undone,
-    and its colour is used to the degree that it is trusted. A trusted exposure replaces each clipped channel by its
-    own value, as `merge_channel` does. A distrusted one only says how much brighter than white a light is, and the
-    light keeps the colour of the brighter exposure, as in `merge_paper`, without its division:
+    Each darker exposure is compared with the next brighter one (`exposure_error`) and put right. It then completes
+    the brighter one where that clips:
 
-        channel:    l + w(l) max(0, d - l)
-        luminance:  l (1 + w(Y) max(0, D - 1))
+        l + w(l) max(0, d - l)
 
-    with l and Y value and luminance of the brighter exposure in units of its white, d and D what the darker ones say
-    of them, and w rising from 0 to 1 between 0.9 and clipping. Both rise with every input, as does any mixture.
+    with l a value of the brighter exposure in units of its white, d what the darker ones say of it, and w rising from
+    0 to 1 between 0.9 and clipping. The darker ones never darken what the brighter one shows, and add no light where
+    it is not clipped: what moved, or is another scene's, leaves no ghost there.
 
     Args, Returns, Raises: as `merge_paper`; any number of EVs.
 
     Warnings:
-        Raising a value never lowers the result at its own pixel and channel: values that tell error and trust are
-        below the threshold, where nothing is taken over. Elsewhere the result rises as well, unless what was raised
-        moves the measured error or trust of the whole exposure; on brackets that agree within 0.05 stops neither
-        moves. Errors of up to 2 stops between neighbours are undone, less 0.05 stops and the scatter.
+        Raising a value never lowers the result at its own pixel and channel: values that tell an error are below the
+        threshold, where nothing is taken over. Elsewhere the result rises as well, unless what was raised moves the
+        measured error of the whole exposure; on brackets that agree within 0.05 stops it does not. Errors of up to 2
+        stops between neighbours are undone, less 0.05 stops and the scatter. A light that the darker exposures show
+        elsewhere is not moved back, and ends at white.
+        Where scenes scatter, giving up a darker exposure's colour for its luminance (as `merge_paper` does) was tried
+        and dropped: bent lights came out worse, and lights of another scene no better.
 
-    Source: Debevec and Malik, Recovering high dynamic range radiance maps from photographs (SIGGRAPH 1997), Eq. 6, and
+    Source: Debevec and Malik, Recovering high dynamic range radiance maps from photographs (SIGGRAPH 1997), and
     Robertson et al., Estimation-theoretic approach to dynamic range enhancement using multiple exposures (Journal of
-    Electronic Imaging 12, 2003), Sec. 4, whose weights fall to 0 at clipping and prefer the longest exposure that is
+    Electronic Imaging 12, 2003), whose weights fall to 0 at clipping; the latter prefer the longest exposure that is
     not clipped, which is what the ramp takes to its limit: averaging in the coarser codes of darker exposures would
     add noise. Sen et al., Robust patch-based HDR reconstruction of dynamic scenes (SIGGRAPH Asia 2012), for one
     reference exposure that the others may only complete where it is clipped; here EV 0.
     """
     balls, evs = _bracket(balls, evs)
     linear = [decode_display(ball, gamma) for ball in balls]
-    colour, level = linear[-1], luminance(linear[-1])
+    merged = linear[-1]
     for i in range(len(balls) - 2, -1, -1):
         shown, stops = linear[i], evs[i] - evs[i + 1]
-        found = compare_exposures(shown, linear[i + 1], stops, gamma)
-        scale = 2.0 ** (stops - found.stops)
-        lit = luminance(shown)
-        by_channel = shown + _ramp(shown) * (colour * scale - shown).clamp(min=0)
-        by_luminance = shown * (1 + _ramp(lit) * (level * scale - 1).clamp(min=0))
-        colour = torch.lerp(by_luminance, by_channel, found.trust)
-        level = lit + _ramp(lit) * (level * scale - lit).clamp(min=0)
-    return colour
+        scale = 2.0 ** (stops - exposure_error(shown, linear[i + 1], stops, gamma))
+        merged = shown + _ramp(shown) * (merged * scale - shown).clamp(min=0)
+    return merged
 
 
 def merge_paper(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:

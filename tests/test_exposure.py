@@ -14,14 +14,13 @@ from dl_core.errors import ImageError, OptionError
 from dl_core.exposure import (
     GAMMA,
     MERGES,
-    Agreement,
     auto_exposure,
     check_evs,
     check_merge,
-    compare_exposures,
     decode_display,
     encode_display,
     expose,
+    exposure_error,
     luminance,
     merge_bracket,
     merge_channel,
@@ -249,35 +248,36 @@ def test_an_exposure_that_is_wrong_as_a_whole_is_put_right(stops: float, generat
     assert float((merge_channel(balls, PAPER_EVS)[bright] / truth[bright]).log2().abs().median()) > 0.3
 
 
-def test_agreement_reports_the_error_of_an_exposure(generator: torch.Generator) -> None:
+def test_the_error_of_an_exposure_is_measured(generator: torch.Generator) -> None:
     truth = lamps(generator)
     shown, darker = decode_display(expose(truth, 0.0)), decode_display(expose(truth, -1.5))
-    found = compare_exposures(shown, darker, 2.0)
     # Half a stop too bright, less the dead zone of 0.05.
-    assert found.stops == pytest.approx(0.45, abs=1e-3)
-    assert found.trust == 1.0
+    assert exposure_error(shown, darker, 2.0) == pytest.approx(0.45, abs=1e-3)
 
 
 def test_too_few_values_are_no_evidence() -> None:
     shown = torch.full((1, 3, 3, 3), 0.5)
-    assert compare_exposures(shown, shown, 2.0) == Agreement()
+    assert exposure_error(shown, shown, 2.0) == 0
 
 
-def test_exposures_of_different_scenes_are_not_trusted(generator: torch.Generator) -> None:
+def test_exposures_of_different_scenes_tell_no_error(generator: torch.Generator) -> None:
     shown = decode_display(expose(lamps(generator), 0.0))
     other = decode_display(expose(100 * torch.rand(1, 48, 48, 3, generator=generator) ** 8, -2.5))
-    found = compare_exposures(shown, other, 2.5)
-    assert found == Agreement(0.0, 0.0)
+    assert exposure_error(shown, other, 2.5) == 0
 
 
-def test_a_distrusted_exposure_gives_brightness_and_no_colour(generator: torch.Generator) -> None:
-    shown = expose(lamps(generator), 0.0)
-    # Red light of every strength, where EV 0 shows something else.
-    red = 30 * torch.rand(1, 48, 48, 1, generator=generator) ** 6 * torch.tensor([1.0, 0.0, 0.0])
-    merged = merge_robust([shown, expose(red, -5.0)], (0.0, -5.0))
-    shade = decode_display(shown)
-    torch.testing.assert_close(merged / merged.sum(-1, keepdim=True), shade / shade.sum(-1, keepdim=True))
-    assert bool((merged >= shade).all())
+@given(st.integers(0, 2**32), st.floats(-3, 3))
+def test_no_darker_exposure_makes_a_ghost(seed: int, stops: float) -> None:
+    """Whatever the darker exposures show, EV 0 is kept where it does not clip, and nowhere darkened."""
+    generator = torch.Generator().manual_seed(seed)
+    balls = [torch.rand(1, 16, 16, 3, generator=generator) for _ in PAPER_EVS]
+    shown = decode_display(balls[0] * 2.0 ** (stops / GAMMA))
+    balls[0] = encode_display(shown)
+    merged = merge_robust(balls, PAPER_EVS)
+    # Encoding and decoding again costs a few float32 roundings.
+    assert bool((merged >= shown * (1 - 1e-5)).all())
+    dim = shown < 0.9
+    torch.testing.assert_close(merged[dim], shown[dim], rtol=1e-5, atol=1e-7)
 
 
 @given(st.integers(0, 2), st.integers(0, 2), st.floats(0, 1), st.lists(st.floats(0, 1), min_size=9, max_size=9))
