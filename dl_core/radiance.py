@@ -118,24 +118,23 @@ def _split(length: int, most: int) -> list[int]:
 
 
 def parse_header(data: bytes) -> PictureHeader:
-    """Read the text at the head of a picture; `data` may be its first kilobytes only.
+    """Read the text at the head of a picture; `data` may be its first kilobytes only. Lines may end as on Windows.
 
     Raises:
         RadianceFormatError: no Radiance picture, XYZE pixels, or an orientation other than top row first.
     """
     if not data.startswith(b"#?"):
         raise RadianceFormatError("is no Radiance picture (it does not start with '#?')")
-    text, blank, rest = data.partition(b"\n\n")
-    resolution, newline, _ = rest.partition(b"\n")
-    if not blank or not newline:
+    head = re.match(rb"(.*?)\r?\n\r?\n(.*?)\r?\n", data, flags=re.DOTALL)
+    if head is None:
         raise RadianceFormatError("ends inside its header")
+    text, resolution = head.groups()
     if b"FORMAT=32-bit_rle_xyze" in text:
         raise RadianceFormatError("holds XYZE pixels; RGBE is accepted")
     size = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})", resolution)
     if size is None:
         raise RadianceFormatError(f"has the resolution line {resolution!r}; '-Y height +X width' is accepted")
-    exposure = _exposure(text)
-    return PictureHeader(int(size[1]), int(size[2]), exposure, len(text) + len(blank) + len(resolution) + 1)
+    return PictureHeader(int(size[1]), int(size[2]), _exposure(text), head.end())
 
 
 def _exposure(text: bytes) -> float:

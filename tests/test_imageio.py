@@ -342,6 +342,14 @@ def test_radiance_exposure_is_undone(tmp_path: Path) -> None:
     assert_close(imageio.read_envmap(tmp_path / "a.hdr"), 1 / 8)
 
 
+def test_radiance_headers_may_end_their_lines_as_on_windows(tmp_path: Path) -> None:
+    head = b"#?RADIANCE\r\nEXPOSURE=2\r\nFORMAT=32-bit_rle_rgbe\r\n\r\n-Y 1 +X 2\r\n"
+    # The first pixel is a line end itself: no byte of it may be taken for the header's.
+    (tmp_path / "a.hdr").write_bytes(head + bytes((13, 10, 13, 129, 128, 128, 128, 129)))
+    expected = torch.tensor([[13.0, 10.0, 13.0], [128.0, 128.0, 128.0]]) / 128 / 2
+    assert_close(imageio.read_envmap(tmp_path / "a.hdr")[0, 0], expected)
+
+
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
