@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -27,6 +28,7 @@ from dl_core.training.lora import train_lora
 from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
 from dl_core.training.procedural import draw_panorama
 from dl_core.training.scenes import SceneSampler
+from dl_core.training.stages import run_stage
 
 ROOT = Path(__file__).parents[1]
 
@@ -233,6 +235,14 @@ def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text('[{"file": "a.exr", "split": "validation"}]')
     with pytest.raises(OptionError, match="validation"):
         panorama_files(tmp_path, "training")
+
+
+def test_a_work_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    options = argparse.Namespace(stage="data", work=tmp_path / "file" / "work", out=tmp_path, seed=1)
+    with pytest.raises(OptionError) as raised:
+        run_stage(options, lambda line: None)
+    assert raised.value.name == "--work"
 
 
 def test_reducing_keeps_the_mean() -> None:

@@ -10,6 +10,7 @@ from typing import Final
 import torch
 
 from ..backends.mini import MINI_FOLDER, MiniModel, load_mini
+from ..errors import OptionError, OutputError
 from ..imageio import require_writable
 from .base import train_base
 from .control import train_control
@@ -100,5 +101,15 @@ def run_stage(args: argparse.Namespace, report: Report) -> list[Path]:
     """
     args.out = args.out or MINI_FOLDER
     require_writable(args.out / "mini.json")
+    _require_work(args.work)
     torch.manual_seed(args.seed)  # random starts: a resumed run builds the same ones
     return _STAGES[args.stage](args, report)
+
+
+def _require_work(folder: Path) -> None:
+    """Make the work folder, if it is not there, and see that it can be written to."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        require_writable(folder / "checkpoint")
+    except (OSError, OutputError) as error:
+        raise OptionError("--work", str(folder), f"a folder that can be made and written to ({error})") from error
