@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
-import os
 import time
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from ..errors import ImageError, OptionError, OutputError
+from ..errors import ImageError, OptionError
 from ..imageio import read_envmap
+from .journal import Journal
 from .pairs import ERROR_COLUMNS, protocol
 from .report import Column, Report, Row, panorama_files, prepare_output, publish
 from .scoring import PROTOCOLS, score_maps, summarize_errors
@@ -63,60 +60,13 @@ def _by_name(option: str, folder: Path) -> dict[str, Path]:
     return found
 
 
-class _Journal:
-    """`rows.jsonl`: a line that says what the run is, then a line for each row; a stopped run goes on from it."""
-
-    def __init__(self, folder: Path | None, identity: Row, each: int) -> None:
-        self.path = None if folder is None else folder / "rows.jsonl"
-        self.rows: list[Row] = []
-        if self.path is not None:
-            self.rows = _whole(_resume(self.path, identity), each)
-            lines = [identity, *self.rows]
-            # Lines of an image that was being written when the run was stopped go.
-            self.path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
-
-    def add(self, rows: list[Row]) -> None:
-        """Keep the rows of an image; they are on the disk when this returns."""
-        self.rows += rows
-        if self.path is None:
-            return
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write("".join(json.dumps(row) + "\n" for row in rows))
-            file.flush()
-            os.fsync(file.fileno())
-
-
-def _resume(path: Path, identity: Row) -> list[Row]:
-    """Rows of an earlier run of the same command; none if there was none."""
-    lines = list(_json_lines(path)) if path.exists() else []
-    if lines and lines[0] != identity:
-        begun = ", ".join(f"{key} {lines[0].get(key)!r}" for key in identity if lines[0].get(key) != identity[key])
-        raise OutputError(path, f"was begun with other options ({begun}); give another --out or remove it")
-    return lines[1:]
-
-
-def _json_lines(path: Path) -> Iterator[Row]:
-    """The lines of a file up to the first that is cut short."""
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        try:
-            yield dict(json.loads(line))
-        except (ValueError, TypeError):
-            return
-
-
-def _whole(rows: list[Row], each: int) -> list[Row]:
-    """Rows of the images that have all of theirs."""
-    counts = Counter(row["panorama"] for row in rows)
-    return [row for row in rows if counts[row["panorama"]] == each]
-
-
 def run(args: argparse.Namespace) -> int:
     """Score every pair of maps, or those that an earlier run left."""
     pairs = pair_maps(args.maps, args.truth)
     prepare_output(args)
     started = time.perf_counter()
-    journal = _Journal(args.out, _identity(args), len(PROTOCOLS[args.protocol].parts))
-    done = {row["panorama"] for row in journal.rows}
+    journal = Journal(args.out, _identity(args), len(PROTOCOLS[args.protocol].parts))
+    done = journal.done
     for predicted, truth in pairs:
         if predicted.stem not in done:
             rows = score_maps(read_envmap(predicted), read_envmap(truth), args.protocol, args.convention)

@@ -1,0 +1,75 @@
+"""Rows of a bench kept on the disk as they are measured, so that a stopped run goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..errors import OutputError
+from .report import Row
+
+__all__ = ["Journal"]
+
+
+class Journal:
+    """`rows.jsonl`: a line that says what the run is, then a line for each row; a stopped run goes on from it.
+
+    Args:
+        folder: of the run, which can be written to; None keeps rows in memory only.
+        identity: what has to be the same for a run to be gone on with, as JSON keeps it.
+        each: rows of a panorama.
+
+    Raises:
+        OutputError: the folder holds rows of a run with another identity; they stay as they are.
+    """
+
+    def __init__(self, folder: Path | None, identity: Row, each: int) -> None:
+        self.path = None if folder is None else folder / "rows.jsonl"
+        self.rows: list[Row] = []
+        if self.path is not None:
+            self.rows = _whole(_resume(self.path, identity), each)
+            lines = [identity, *self.rows]
+            # Lines of a panorama that was being written when the run was stopped go.
+            self.path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+
+    @property
+    def done(self) -> set[str]:
+        """Names of the panoramas whose rows are there."""
+        return {row["panorama"] for row in self.rows}
+
+    def add(self, rows: list[Row]) -> None:
+        """Keep the rows of a panorama; they are on the disk when this returns."""
+        self.rows += rows
+        if self.path is None:
+            return
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write("".join(json.dumps(row) + "\n" for row in rows))
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _resume(path: Path, identity: Row) -> list[Row]:
+    """Rows of an earlier run of the same command; none if there was none."""
+    lines = list(_json_lines(path)) if path.exists() else []
+    if lines and lines[0] != identity:
+        begun = ", ".join(f"{key} {lines[0].get(key)!r}" for key in identity if lines[0].get(key) != identity[key])
+        raise OutputError(path, f"was begun with other options ({begun}); give another --out or remove it")
+    return lines[1:]
+
+
+def _json_lines(path: Path) -> Iterator[Row]:
+    """The lines of a file up to the first that is cut short."""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            yield dict(json.loads(line))
+        except (ValueError, TypeError):
+            return
+
+
+def _whole(rows: list[Row], each: int) -> list[Row]:
+    """Rows of the panoramas that have all of theirs."""
+    counts = Counter(row["panorama"] for row in rows)
+    return [row for row in rows if counts[row["panorama"]] == each]
