@@ -45,6 +45,8 @@ LIGHT_EDGE: Final = 1 / 3
 """Share of a light's peak down to which pixels belong to it (Gardner et al. 2019, Sec. 3)."""
 _SEARCH_ROWS: Final = 32
 """Rows that a map is reduced to for the search; the direction itself is measured on the full map."""
+_STRIP: Final = 1 << 15
+"""Pixels of a map whose light is summed at once."""
 _RECENTRINGS: Final = 3
 """Times the winning cap is moved to the centroid of its light, so that a light is not cut by the search's grid."""
 
@@ -73,7 +75,10 @@ def irradiance(latlong_hdr: Latlong, normals: Directions) -> Float[Tensor, "b n 
     weights = latlong_solid_angles(height, device=latlong_hdr.device)
     directions = latlong_directions(height, device=latlong_hdr.device)
     light = (latlong_hdr * weights[None, :, :, None]).flatten(1, 2)
-    return (normals.to(light) @ directions.reshape(-1, 3).T).clamp(min=0) @ light
+    # One product serves every map of the batch, and strips keep large maps within memory.
+    strips = zip(light.transpose(0, 1).split(_STRIP), directions.reshape(-1, 3).split(_STRIP), strict=True)
+    lit = sum((normals.to(light) @ towards.T).clamp(min=0) @ part.flatten(1) for part, towards in strips)
+    return torch.as_tensor(lit).unflatten(1, (len(light), -1)).transpose(0, 1)
 
 
 def energy_kept(estimate_hdr: Latlong, truth_hdr: Latlong) -> float:

@@ -13,7 +13,7 @@ import torch
 from dl_core.bench import cli, geometry, oracle, report
 from dl_core.bench.reference import reference_merge, reference_unwrap
 from dl_core.bench.skies import SunAndSky
-from dl_core.errors import OptionError
+from dl_core.errors import OptionError, OutputError
 from dl_core.exposure import MERGES, quantize
 from dl_core.geometry import ball_to_latlong, latlong_directions, latlong_to_ball
 from dl_core.imageio import write_exr
@@ -130,6 +130,32 @@ def test_the_command_reports_and_draws(panoramas: Path, tmp_path: Path, capsys: 
     assert len(result["summary"]) == 2
     assert (tmp_path / "oracle.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in (tmp_path / "oracle.svg").read_bytes()
+
+
+def test_a_stopped_run_goes_on_and_another_is_refused(panoramas: Path, tmp_path: Path) -> None:
+    options = ["--panoramas", str(panoramas), "--evs", "0,-2.5", "--merge", "robust", "--ball", "32"]
+    options += ["--out", str(tmp_path), "--json"]
+    cli.run(parse("oracle", *options))
+    whole, journal = (tmp_path / "report.json"), tmp_path / "rows.jsonl"
+    rows = json.loads(whole.read_text(encoding="utf-8"))["rows"]
+    # Stopped while the second panorama was written; the first one's rows are marked, to see that they are kept.
+    lines = journal.read_text(encoding="utf-8").replace('"ball_px": 32', '"ball_px": 32.5').splitlines()
+    journal.write_text("\n".join(lines[:-1]) + '\n{"panorama": "su', encoding="utf-8")
+    cli.run(parse("oracle", *options))
+    again = json.loads(whole.read_text(encoding="utf-8"))["rows"]
+    assert [row.pop("ball_px") for row in again] == [32.5, 32.5, 32, 32]
+    for row in rows:
+        del row["ball_px"]
+    assert again == rows
+    with pytest.raises(OutputError, match="seed 0"):
+        cli.run(parse("oracle", *options, "--seed", "1"))
+
+
+def test_two_maps_of_one_name_are_refused(panoramas: Path, tmp_path: Path) -> None:
+    for name in ("a.exr", "a.hdr"):
+        (tmp_path / name).write_bytes((panoramas / "smooth.exr").read_bytes())
+    with pytest.raises(OptionError, match="one map of a name"):
+        cli.run(parse("oracle", "--panoramas", str(tmp_path)))
 
 
 @pytest.mark.parametrize(

@@ -3,18 +3,24 @@
 A true orthographic mirror ball of a known panorama, exposed at the bracket's EVs and rounded to 8 bits, goes through
 each combination of merge and unwrap; the map that comes out is compared with the panorama. With `--misaligned` the
 exposures disagree as `misalign` describes.
+
+A run with `--out` keeps its rows in `rows.jsonl` panorama by panorama, and goes on from them when it is run again.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Final
 
+import torch
 from torch import Tensor
 
 from ..errors import OptionError
@@ -25,6 +31,7 @@ from ..metrics import angular_error, energy_kept, irradiance, si_rmse, spread_di
 from ..presets import PAPER_EVS
 from ..shapes import BallImage, Latlong
 from .charts import bar_chart
+from .journal import Journal
 from .misalign import MISALIGNMENTS, misaligned_bracket
 from .reference import reference_merge, reference_unwrap
 from .report import (
@@ -42,6 +49,8 @@ from .report import (
 __all__ = ["EXPOSURES", "UNWRAPS", "WAYS", "Case", "add_arguments", "bench_oracle", "recover", "run", "summarize"]
 
 NORMALS: Final = 400
+BATCH_VALUES: Final = 1 << 26
+"""Values of maps that are compared at once: 256 MB."""
 LONG_EVS: Final = (*PAPER_EVS, -7.5, -10.0)
 ALIGNED: Final = next(iter(MISALIGNMENTS))
 
@@ -147,15 +156,33 @@ def run(args: argparse.Namespace) -> None:
     if not 16 <= args.ball <= 4096:
         raise OptionError("--ball", args.ball, "16 to 4096 pixels")
     files = panorama_files(args.panoramas)
+    if len({path.stem for path in files}) < len(files):
+        raise OptionError("--panoramas", str(args.panoramas), "one map of a name; rows are told apart by it")
     prepare_output(args)
     cases = list(_cases(levels, brackets, args.merge, args.unwrap))
-    rows = bench_oracle(files, cases, ball=args.ball, exposure=args.exposure, seed=args.seed)
+    journal = Journal(args.out, _identity(args, files, cases), len(cases))
+    rows = bench_oracle(files, cases, ball=args.ball, exposure=args.exposure, seed=args.seed, journal=journal)
     summary = summarize(rows)
     report = Report("oracle", PROTOCOL, rows, summary, time.perf_counter() - started, seeds=(args.seed,))
     if args.out is not None:
         bars = [(" ".join(str(line[key]) for key in Case(ALIGNED, (), "", "").labels()), line) for line in summary]
         bar_chart(args.out / "oracle", bars, "irradiance_si_rmse", "si-RMSE of irradiance, median and worst")
     publish(report, args, rows=(Column("panorama", "panorama"), *FIGURES), summary=FIGURES)
+
+
+def _identity(args: argparse.Namespace, files: Sequence[Path], cases: Sequence[Case]) -> Row:
+    """What has to be the same for a run to be gone on with; files only as a fingerprint.
+
+    All of them count: each is the other scene of the next one's misalignments.
+    """
+    names = "\n".join(str(path.resolve()) for path in files)
+    return {
+        "ball": args.ball,
+        "exposure": args.exposure,
+        "seed": args.seed,
+        "cases": [" ".join(map(str, case.labels().values())) for case in cases],
+        "panoramas": hashlib.sha256(names.encode()).hexdigest()[:16],
+    }
 
 
 def _parse_evs(text: str) -> tuple[float, ...]:
@@ -182,28 +209,37 @@ def _cases(
                 yield from (Case(level, evs, merge, unwrap) for unwrap in chosen)
 
 
-def recover(ball_hdr: BallImage, other_hdr: BallImage, case: Case, height: int, seed: int) -> Latlong:
-    """The map that a case makes of a ball.
+def recover(ball_hdr: BallImage, other_hdr: BallImage, cases: Sequence[Case], height: int, seed: int) -> list[Latlong]:
+    """The maps that cases of one level and one bracket make of a ball.
 
     Args:
         ball_hdr: the true ball, linear radiance.
         other_hdr: that of another scene, for misalignments that mix scenes.
-        case: the way.
-        height: rows of the map.
+        cases: ways, which share the pictures that are painted of the ball.
+        height: rows of the maps.
         seed: of the misalignment.
     """
-    if case.merge == "hdr":
-        return UNWRAPS[case.unwrap](ball_hdr, height)
-    if case.merge == "ceiling":
-        return UNWRAPS[case.unwrap](ball_hdr.clamp(max=2.0 ** -case.evs[-1]), height)
-    bracket = misaligned_bracket(ball_hdr, case.evs, case.misaligned, seed=seed, other=other_hdr)
-    if case.merge == "reference":
-        return reference_merge(bracket, case.evs, height)
-    return UNWRAPS[case.unwrap](merge_bracket(bracket, case.evs, case.merge), height)
+    level, evs = cases[0].misaligned, cases[0].evs
+    painted = misaligned_bracket(ball_hdr, evs, level, seed=seed, other=other_hdr)
+    merged: dict[str, BallImage] = {"hdr": ball_hdr, "ceiling": ball_hdr.clamp(max=2.0 ** -evs[-1])}
+    merged |= {case.merge: merge_bracket(painted, evs, case.merge) for case in cases if case.merge in MERGES}
+    found: dict[Case, Latlong] = {}
+    for unwrap in dict.fromkeys(case.unwrap for case in cases):
+        ways = [case for case in cases if case.unwrap == unwrap and case.merge in merged]
+        if ways:
+            maps = UNWRAPS[unwrap](torch.cat([merged[case.merge] for case in ways]), height)
+            found |= zip(ways, maps.split(1), strict=True)
+    return [found[case] if case in found else reference_merge(painted, evs, height) for case in cases]
 
 
 def bench_oracle(
-    panoramas: Sequence[Path], cases: Sequence[Case], *, ball: int = 256, exposure: str = "map", seed: int = 0
+    panoramas: Sequence[Path],
+    cases: Sequence[Case],
+    *,
+    ball: int = 256,
+    exposure: str = "map",
+    seed: int = 0,
+    journal: Journal | None = None,
 ) -> list[Row]:
     """Measure every case on every panorama.
 
@@ -213,34 +249,51 @@ def bench_oracle(
         ball: its diameter in pixels.
         exposure: key of `EXPOSURES`.
         seed: of misalignments; each panorama has its own, by name.
+        journal: holds the panoramas that are measured already, and keeps the others.
 
     Returns:
         One row a panorama and case: their names, and the figures of `PROTOCOL`. The other scene of a misalignment is
         the panorama before it, for the first one the last.
     """
-    normals = spread_directions(NORMALS)
-    other = latlong_to_ball(_exposed(panoramas[-1], exposure), ball)
-    rows: list[Row] = []
-    for path in panoramas:
+    journal = journal or Journal(None, {}, len(cases))
+
+    @lru_cache(maxsize=2)
+    def scene(path: Path) -> tuple[Latlong, BallImage]:
         latlong = _exposed(path, exposure)
-        truth, shown = irradiance(latlong, normals), expose(latlong, 0.0)
-        true_ball = latlong_to_ball(latlong, ball)
-        for case in cases:
-            found = recover(true_ball, other, case, latlong.shape[1], seed + zlib.crc32(path.stem.encode()))
-            lit = irradiance(found, normals)
-            rows.append(
-                {
-                    "panorama": path.stem,
-                    **case.labels(),
-                    "ball_px": ball,
-                    "energy_kept": energy_kept(found, latlong),
-                    "irradiance_si_rmse": si_rmse(lit, truth),
-                    "irradiance_angular_error_deg": angular_error(lit, truth),
-                    "ldr_rmse": float((expose(found, 0.0) - shown).square().mean().sqrt()),
-                }
-            )
-        other = true_ball
-    return rows
+        return latlong, latlong_to_ball(latlong, ball)
+
+    for before, path in zip([panoramas[-1], *panoramas], panoramas, strict=False):
+        if path.stem not in journal.done:
+            other, (latlong, true_ball) = scene(before)[1], scene(path)
+            own = seed + zlib.crc32(path.stem.encode())
+            found = _recovered(true_ball, other, cases, latlong.shape[1], own)
+            journal.add([{"panorama": path.stem, "ball_px": ball, **row} for row in _compared(found, latlong)])
+    order = [path.stem for path in panoramas]
+    return sorted(journal.rows, key=lambda row: order.index(row["panorama"]))
+
+
+def _recovered(
+    ball: BallImage, other: BallImage, cases: Sequence[Case], height: int, seed: int
+) -> Iterator[tuple[Case, Latlong]]:
+    for _, same in groupby(cases, key=lambda case: (case.misaligned, case.evs)):
+        group = list(same)
+        yield from zip(group, recover(ball, other, group, height, seed), strict=True)
+
+
+def _compared(found: Iterator[tuple[Case, Latlong]], truth: Latlong) -> Iterator[Row]:
+    """Figures of maps; so many of them at a time that irradiance is cheap and memory bounded."""
+    normals = spread_directions(NORMALS)
+    lit_truth, shown = irradiance(truth, normals), expose(truth, 0.0)
+    while batch := list(islice(found, max(1, BATCH_VALUES // truth.numel()))):
+        lit = irradiance(torch.cat([latlong for _, latlong in batch]), normals).split(1)
+        for (case, latlong), light in zip(batch, lit, strict=True):
+            yield {
+                **case.labels(),
+                "energy_kept": energy_kept(latlong, truth),
+                "irradiance_si_rmse": si_rmse(light, lit_truth),
+                "irradiance_angular_error_deg": angular_error(light, lit_truth),
+                "ldr_rmse": float((expose(latlong, 0.0) - shown).square().mean().sqrt()),
+            }
 
 
 def _exposed(path: Path, exposure: str) -> Latlong:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final
 
 import torch
@@ -51,12 +52,17 @@ def reference_unwrap(ball: BallImage, height: int) -> Latlong:
         ball: (B, D, D, C), display-encoded in the scripts; linear values pass as well.
         height: rows of the map; its width is twice that.
     """
-    size = ball.shape[1]
-    disc = disc_coordinates(_closed_grid(height * SUPERSAMPLING)) * (1 - 2 * RADIUS_SHORT / size)
-    grid = torch.stack((disc[..., 0], -disc[..., 1]), dim=-1).expand(ball.shape[0], -1, -1, -1)
+    grid = _sample_grid(ball.shape[1], height).expand(ball.shape[0], -1, -1, -1)
     planes = ball.permute(0, 3, 1, 2)
     fine = F.grid_sample(planes, grid, mode="bilinear", padding_mode="border", align_corners=False)
     return F.interpolate(fine, size=(height, 2 * height), mode="bilinear", antialias=True).permute(0, 2, 3, 1)
+
+
+@lru_cache(maxsize=2)
+def _sample_grid(size: int, height: int) -> Float[Tensor, "h w 2"]:
+    """Where on a ball's crop each sample of a supersampled map lies, -1 to 1."""
+    disc = disc_coordinates(_closed_grid(height * SUPERSAMPLING)) * (1 - 2 * RADIUS_SHORT / size)
+    return torch.stack((disc[..., 0], -disc[..., 1]), dim=-1)
 
 
 def reference_merge(balls_ldr: Sequence[BallImage], evs: Sequence[float], height: int) -> Latlong:
