@@ -102,21 +102,30 @@ def scenes() -> list[torch.Tensor]:
 
 
 UNRELATED = ("highlights-1", "detail-1")
-"""Levels whose darker exposures hold nothing of this scene's lights: no merge can be right there. Robust loses to paper
-on these suns (detail-1: 0.42 against 0.38 si-RMSE), and where only highlights differ nothing tells that they do."""
+"""Levels whose darker exposures hold nothing of this scene's lights: no merge can be right there, and luck decides. On
+these suns paper is luckier than robust and channel (0.38 against 0.42 si-RMSE); over photographed panoramas it is not
+(`lightprobe bench oracle --misaligned`)."""
 
 
-@pytest.mark.parametrize("level", [level for level in MISALIGNMENTS if level not in UNRELATED])
-def test_robust_is_at_least_as_good_as_paper(level: str, scenes: list[torch.Tensor]) -> None:
-    """Median over scenes of the error of irradiance, which on a ball is a sum over its pixels: each covers the same."""
+def errors(level: str, merge: str, scenes: list[torch.Tensor]) -> torch.Tensor:
+    """Medians over scenes of the errors of irradiance: si-RMSE, and angle in degrees.
+
+    Irradiance on a ball is a sum over its pixels: each covers the same.
+    """
     weights = (spread_directions(100) @ ball_directions(128).reshape(-1, 3).T).clamp(min=0)
     weights = weights * ball_coverage(128).reshape(-1)
-    errors: dict[str, list[tuple[float, float]]] = {"robust": [], "paper": []}
+    found = []
     for i, ball in enumerate(scenes):
         balls = misaligned_bracket(ball, EVS, level, seed=i, other=scenes[i - 1])
-        truth = weights @ ball.reshape(-1, 3)
-        for merge, found in errors.items():
-            lit = weights @ merge_bracket(balls, EVS, merge).reshape(-1, 3)
-            found.append((si_rmse(lit, truth), angular_error(lit, truth)))
-    robust, paper = (torch.tensor(found).median(dim=0).values for found in errors.values())
-    assert bool((robust <= paper).all()), (robust, paper)
+        lit, truth = (weights @ light.reshape(-1, 3) for light in (merge_bracket(balls, EVS, merge), ball))
+        found.append((si_rmse(lit, truth), angular_error(lit, truth)))
+    return torch.tensor(found).median(dim=0).values
+
+
+@pytest.mark.parametrize("level", MISALIGNMENTS)
+def test_robust_is_at_least_as_good_as_the_others(level: str, scenes: list[torch.Tensor]) -> None:
+    robust, channel, paper = (errors(level, merge, scenes) for merge in ("robust", "channel", "paper"))
+    # Where no error of exposure is found, both merge the same values but for float32 roundings.
+    assert bool((robust <= channel * (1 + 1e-4)).all()), (robust, channel)
+    if level not in UNRELATED:
+        assert bool((robust <= paper).all()), (robust, paper)
