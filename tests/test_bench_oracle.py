@@ -13,11 +13,12 @@ import torch
 from dl_core.bench import cli, geometry, oracle, report
 from dl_core.bench.reference import reference_merge, reference_unwrap
 from dl_core.bench.skies import SunAndSky
-from dl_core.errors import OptionError, OutputError
+from dl_core.errors import ImageError, OptionError, OutputError
 from dl_core.exposure import MERGES, quantize
 from dl_core.geometry import ball_to_latlong, latlong_directions, latlong_to_ball
 from dl_core.imageio import write_exr
 from dl_core.presets import PAPER_EVS
+from dl_core.radiance import encode_picture
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +164,12 @@ def test_two_maps_of_one_name_are_refused(panoramas: Path, tmp_path: Path) -> No
     for name in ("a.exr", "a.hdr"):
         (tmp_path / name).write_bytes((panoramas / "smooth.exr").read_bytes())
     with pytest.raises(OptionError, match="one map of a name"):
+        cli.run(parse("oracle", "--panoramas", str(tmp_path)))
+
+
+def test_a_map_that_is_not_2_to_1_is_named(tmp_path: Path) -> None:
+    (tmp_path / "square.hdr").write_bytes(encode_picture(torch.ones(16, 16, 3).numpy()))
+    with pytest.raises(ImageError, match=r"square\.hdr"):
         cli.run(parse("oracle", "--panoramas", str(tmp_path)))
 
 

@@ -9,7 +9,7 @@ with Z the angle from the zenith, χ the angle from the sun, Zs the sun's zenith
 a = -1, b = -0.32, c = 10, d = -3, e = 0.45. The sun is a disc of uniform radiance: its irradiance on a surface that
 faces it is π sin²(r) times its radiance, r being its angular radius.
 
-Source: CIE S 011/E:2003 (ISO 15469:2004), Spatial distribution of daylight, equations 1 to 5 and table 1; Darula and
+Source: CIE S 011/E:2003 (ISO 15469:2004), Spatial distribution of daylight; Darula and
 Kittler, CIE general sky standard defining luminance distributions (eSim 2002), where both are printed.
 """
 
