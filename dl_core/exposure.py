@@ -203,7 +203,8 @@ def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = G
         stops between neighbours are undone, less 0.05 stops and the scatter. A light that the darker exposures show
         elsewhere is not moved back, and ends at white.
         Where scenes scatter, giving up a darker exposure's colour for its luminance (as `merge_paper` does) was tried
-        and dropped: bent lights came out worse, and lights of another scene no better.
+        and dropped: over photographed panoramas shifted and bent lights came out worse and lights of another scene no
+        better; only on balls of different seeds were colours closer, 0.96 for 1.03 degrees of irradiance at the median.
 
     Source: Debevec and Malik, Recovering high dynamic range radiance maps from photographs (SIGGRAPH 1997), and
     Robertson et al., Estimation-theoretic approach to dynamic range enhancement using multiple exposures (Journal of
