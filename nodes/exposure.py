@@ -156,7 +156,7 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
                 io.Combo.Input(
                     "method",
                     options=list(MERGES),
-                    tooltip="robust: each colour by itself as far as the exposures agree, by luminance else. "
+                    tooltip="robust: each colour by itself, errors of exposure undone. "
                     "channel: each colour by itself always. paper: luminance only, with the chroma of EV 0.",
                 ),
                 io.Float.Input(
