@@ -43,15 +43,18 @@ __all__ = [
     "latlong_coverage",
     "latlong_directions",
     "latlong_energy",
+    "latlong_neighbours",
     "latlong_solid_angles",
     "latlong_to_ball",
     "latlong_to_perspective",
+    "require_latlong",
     "rotate_latlong",
     "sample_latlong",
 ]
 
 
-def _require_latlong(latlong: Tensor) -> None:
+def require_latlong(latlong: Tensor) -> None:
+    """Raise OptionError unless a tensor is a batch of maps, (B, H, 2H, C)."""
     if latlong.ndim != 4 or latlong.shape[2] != 2 * latlong.shape[1]:
         raise OptionError("latlong", tuple(latlong.shape), "shape (batch, height, 2 x height, channels)")
 
@@ -125,7 +128,7 @@ def latlong_solid_angles(height: int, *, device: torch.device | None = None) -> 
 
 def latlong_energy(latlong: Latlong) -> Float[Tensor, "b c"]:
     """Radiance integrated over the sphere, per image and channel (radiance x sr)."""
-    _require_latlong(latlong)
+    require_latlong(latlong)
     weights = latlong_solid_angles(latlong.shape[1], device=latlong.device)
     return (latlong.double() * weights[None, :, :, None]).sum(dim=(1, 2)).to(latlong.dtype)
 
@@ -157,10 +160,35 @@ def sample_latlong(latlong: Latlong, directions: Float[Tensor, "*n 3"]) -> Float
         latlong: (B, H, 2H, C), display-encoded or linear: values are interpolated as they are.
         directions: (..., 3), the same for every map of the batch.
     """
-    _require_latlong(latlong)
+    require_latlong(latlong)
     u, v = latlong_coordinates(directions)
     height, width = latlong.shape[1:3]
     return _bilinear(_pad_sphere(latlong), u * width + 1, v * height + 1)
+
+
+def latlong_neighbours(
+    directions: Float[Tensor, "*n 3"], height: int
+) -> tuple[Int[Tensor, "*n 4"], Float[Tensor, "*n 4"]]:
+    """Pixels that `sample_latlong` reads in given directions, row by row, and their shares, which add up to 1.
+
+    Args:
+        directions: (..., 3), of any length above zero.
+        height: rows of the map, 1 or more.
+
+    Raises:
+        OptionError: a height below 1.
+    """
+    _require_height(height)
+    u, v = latlong_coordinates(directions)
+    column, row = u * (2 * height) + 0.5, v * height + 0.5
+    left, top = column.floor().clamp(0, 2 * height), row.floor().clamp(0, height)
+    pixels = torch.arange(2.0 * height * height, dtype=torch.float64, device=directions.device).view(1, height, -1, 1)
+    padded = _pad_sphere(pixels)[0, ..., 0]
+    rows = torch.stack((top, top, top + 1, top + 1), dim=-1).long()
+    columns = torch.stack((left, left + 1, left, left + 1), dim=-1).long()
+    across, down = column - left, row - top
+    shares = ((1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down)
+    return padded[rows, columns].long(), torch.stack(shares, dim=-1)
 
 
 def rotate_latlong(latlong: Latlong, rotation: Float[Tensor, "3 3"], *, samples: int | None = None) -> Latlong:
@@ -175,7 +203,7 @@ def rotate_latlong(latlong: Latlong, rotation: Float[Tensor, "3 3"], *, samples:
     Raises:
         OptionError: a map that is not 2:1, or samples outside 1 to 64.
     """
-    _require_latlong(latlong)
+    require_latlong(latlong)
     height = latlong.shape[1]
     turn = rotation.to(latlong)
 
@@ -314,7 +342,7 @@ def latlong_to_ball(
 
     Source: DiffusionLight, Sec. 4.2 (training pairs: a chrome ball rendered from a panorama).
     """
-    _require_latlong(latlong)
+    require_latlong(latlong)
     radius, centre = _placed(size, radius, centre)
     samples = _ball_samples(latlong.shape[1], radius) if samples is None else samples
     _require_samples(samples)
@@ -516,7 +544,7 @@ def latlong_to_perspective(
     """
     if not 1 <= fov <= 179:
         raise OptionError("fov", fov, "1 to 179 degrees")
-    _require_latlong(latlong)
+    require_latlong(latlong)
     extent = math.tan(math.radians(fov) / 2) * 2 / max(height, width)
     turn = (torch.eye(3) if rotation is None else rotation).to(latlong)
 

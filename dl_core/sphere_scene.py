@@ -30,7 +30,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .errors import OptionError
-from .geometry import sample_latlong
+from .geometry import latlong_neighbours, require_latlong, sample_latlong
 from .microfacet import Surface
 from .shapes import Image, Latlong
 
@@ -184,11 +184,48 @@ def view_coverage(view: View, *, samples: int = 8) -> Float[Tensor, "h w"]:
 
 def _mirror(latlong_hdr: Latlong, surface: Surface, view: View) -> Float[Tensor, "b rows columns c"]:
     """Mean of what each pixel reflects: 0.3 map pixels of a 128-row map between samples at the centre."""
+    batch, height = latlong_hdr.shape[:2]
+    seen = _reflections(surface, view, height)
+    dense = latlong_hdr.permute(1, 2, 0, 3).flatten(0, 1).flatten(1)
+    starts, columns, shares = (part.to(latlong_hdr.device) for part in (seen.starts, seen.columns, seen.shares))
+    rows = F.embedding_bag(columns, dense, starts, mode="sum", per_sample_weights=shares.to(dense.dtype))
+    return _place(view, seen.pixels, rows.unflatten(1, (batch, -1)).transpose(0, 1))
+
+
+@dataclass(frozen=True)
+class _Reflections:
+    """What pixels that show a mirror see of a map's: rows of a sparse matrix.
+
+    Attributes:
+        pixels: which pixels of the picture, (n,).
+        starts: where the entries of each begin, (n,).
+        columns: pixels of the map, (entries,).
+        shares: of their radiance, (entries,).
+    """
+
+    pixels: Tensor
+    starts: Tensor
+    columns: Tensor
+    shares: Tensor
+
+
+@lru_cache(maxsize=4)
+@torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
+def _reflections(surface: Surface, view: View, height: int) -> _Reflections:
     points = _samples(view, min(16, max(4, math.ceil(560 / view.radius))))
-    towards = _mirror_directions(view, points).to(latlong_hdr)
-    reflected = surface.fresnel(torch.cos(points.incidence)).to(latlong_hdr)
-    values = sample_latlong(latlong_hdr, towards) * reflected[None, ..., None]
-    return _place(view, points.pixels, points.average(values))
+    columns, shares = latlong_neighbours(_mirror_directions(view, points), height)
+    covered = points.inside / points.inside.sum(-1, keepdim=True)
+    shares = shares * (covered * surface.fresnel(torch.cos(points.incidence)))[..., None]
+    pixel = torch.arange(len(points.pixels)).view(-1, 1, 1).expand_as(columns)
+    seen = shares > 0
+    size = (len(points.pixels), 2 * height**2)
+    matrix = torch.sparse_coo_tensor(
+        torch.stack((pixel[seen], columns[seen])), shares[seen], size, check_invariants=True
+    )
+    matrix = matrix.coalesce()
+    pixel, columns = matrix.indices()
+    starts = torch.searchsorted(pixel, torch.arange(size[0]))
+    return _Reflections(points.pixels, starts, columns, matrix.values())
 
 
 def _mirror_directions(view: View, points: _Samples) -> Float[Tensor, "n s 3"]:
@@ -325,4 +362,5 @@ def render_sphere(latlong_hdr: Latlong, surface: Surface, view: View) -> Float[T
         Under a rough surface the map is reduced to 128 rows. Lights one pixel wide keep their energy up to 384 rows;
         reduce larger maps first, by solid angle.
     """
+    require_latlong(latlong_hdr)
     return (_mirror if surface.is_mirror else _rough)(latlong_hdr, surface, view)

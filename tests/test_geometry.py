@@ -23,6 +23,7 @@ from dl_core.geometry import (
     latlong_coordinates,
     latlong_directions,
     latlong_energy,
+    latlong_neighbours,
     latlong_solid_angles,
     latlong_to_ball,
     latlong_to_perspective,
@@ -472,3 +473,14 @@ def test_wrong_options_are_named(call: object, name: str) -> None:
     with pytest.raises(OptionError) as raised:
         call()  # type: ignore[operator]
     assert raised.value.name == name
+
+
+def test_neighbours_are_those_that_sampling_reads(generator: torch.Generator) -> None:
+    """Directions from everywhere, both poles and the seam among them."""
+    latlong = torch.rand(1, 9, 18, 3, generator=generator)
+    special = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1e-7, 0.0, 1.0], [-1e-7, 0.1, 1.0]])
+    directions = torch.cat((torch.randn(500, 3, generator=generator), special))
+    pixels, shares = latlong_neighbours(directions, 9)
+    read = (latlong[0].flatten(0, 1)[pixels] * shares[..., None]).sum(-2)
+    # Positions in a map of 18 columns are rounded to 18 x 6e-8 of a pixel, twice.
+    torch.testing.assert_close(read, sample_latlong(latlong, directions)[0], rtol=0, atol=1e-5)

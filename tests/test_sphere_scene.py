@@ -96,6 +96,22 @@ def test_a_mirror_shows_what_its_points_reflect() -> None:
     torch.testing.assert_close(picture, reflected * schlick, rtol=0, atol=6e-3)
 
 
+def test_a_mirror_is_linear_in_maps_of_any_size_and_gives_gradients() -> None:
+    """Its matrix is that of `sample_latlong`: uniform light comes back dimmed by Schlick's factor."""
+    inside = shown_well_inside(SMALL, 0.8)
+    for height in (2, 31, 128):
+        latlong = torch.full((2, height, 2 * height, 3), 3.0, requires_grad=True)
+        picture = render_sphere(latlong, AUTHORS_SPHERES["mirror"], SMALL)
+        _, normals, views = points_on_sphere(SMALL)
+        schlick = (0.8 + 0.2 * (1 - (normals * views).sum(-1)) ** 5)[inside].float()
+        # A pixel is the mean over its area: second order in its size, 1e-3 here.
+        torch.testing.assert_close(picture[1, ..., 0][inside], 3 * schlick, rtol=3e-3, atol=0)
+        picture.sum().backward()
+        assert_close(latlong.grad.sum() * 3, picture.detach().sum())
+    with pytest.raises(OptionError, match="latlong"):
+        render_sphere(torch.ones(1, 8, 15, 3), AUTHORS_SPHERES["mirror"], SMALL)
+
+
 def test_a_highlight_is_where_the_mirror_shows_the_light() -> None:
     light = (
         latlong_directions(128) @ torch.nn.functional.normalize(torch.tensor([0.5, 0.4, 0.7]), dim=0) > 0.998
