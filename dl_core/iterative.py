@@ -5,17 +5,17 @@ Source: DiffusionLight, Algorithm 1 and Sec. 4.1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .ball import paste_ball
+from .ball import paint_depth, paste_ball
 from .errors import OptionError
 from .median import pixelwise_median, pixelwise_spread
 from .painter import Observer, Painter, PaintRequest, SilentObserver
-from .shapes import BallImage
+from .shapes import BallImage, Image
 
 __all__ = ["IterativeResult", "Rounds", "iterative_inpaint", "rounds_evaluations"]
 
@@ -60,6 +60,7 @@ class IterativeResult:
         spread: (1, D, D, 3) median absolute deviation of the last round's balls.
         balls: (N, D, D, 3) the last round's balls.
         evaluations: denoiser evaluations spent.
+        notes: what the painter had to say (`painter.PaintResult`), in order.
     """
 
     ball: BallImage
@@ -67,6 +68,7 @@ class IterativeResult:
     spread: BallImage
     balls: Float[Tensor, "n d d c"]
     evaluations: int
+    notes: tuple[str, ...] = ()
 
 
 def iterative_inpaint(
@@ -74,6 +76,8 @@ def iterative_inpaint(
     request: PaintRequest,
     rounds: Rounds,
     observer: Observer | None = None,
+    *,
+    depth_of: Callable[[Image], Image] | None = None,
 ) -> IterativeResult:
     """Paint a ball by iterative inpainting (Algorithm 1).
 
@@ -83,6 +87,9 @@ def iterative_inpaint(
             and steps are replaced by those of `rounds`.
         rounds: N, k, γ and steps.
         observer: hears of progress; may stop the run by raising.
+        depth_of: depth of a canvas, (1, S, S, 3) -> (1, h, w, 1 or 3), near is bright. With it every median's composite
+            gets a depth map of its own, as in the authors' code; without it all rounds use the request's, which the
+            first round uses in any case.
 
     Returns:
         The ball with the median, the spread and the cost. Each median is pasted on the original photograph, not on
@@ -91,27 +98,37 @@ def iterative_inpaint(
     observer = observer or SilentObserver()
     seed = request.seeds[0]
     seeds = tuple(seed + j for j in range(rounds.balls))
-    canvas, evaluations = request.canvas, 0
+    scene, spent, notes = request, list[int](), list[str]()
 
     def inpaint_balls(wanted: tuple[int, ...], strength: float) -> BallImage:
-        nonlocal evaluations
-        asked = replace(request, canvas=canvas, seeds=wanted, strength=strength, steps=rounds.steps)
+        asked = replace(scene, seeds=wanted, strength=strength, steps=rounds.steps)
         result = painter.paint(asked, observer)
-        evaluations += result.evaluations
+        spent.append(result.evaluations)
+        notes.extend(result.notes)
         return result.balls
+
+    def found(ball: BallImage, median: BallImage, balls: Float[Tensor, "n d d c"]) -> IterativeResult:
+        return IterativeResult(ball, median, pixelwise_spread(balls), balls, sum(spent), tuple(notes))
 
     if rounds.rounds == 0:
         ball = inpaint_balls((seed,), 1.0)
         observer.painted(request.ev, 0, ball)
-        return IterativeResult(ball, ball, torch.zeros_like(ball), ball, evaluations)
+        return found(ball, ball, ball)
 
     for i in range(rounds.rounds):
         balls = inpaint_balls(seeds, rounds.strength if i > 0 else 1.0)
         median = pixelwise_median(balls)
         observer.painted(request.ev, i, balls)
-        canvas = paste_ball(request.canvas, median, request.ball)
+        scene = _with_median(request, median, depth_of)
     ball = inpaint_balls((seed,), rounds.strength) if rounds.final else median
-    return IterativeResult(ball, median, pixelwise_spread(balls), balls, evaluations)
+    return found(ball, median, balls)
+
+
+def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[Image], Image] | None) -> PaintRequest:
+    """The request on the photograph with a median pasted in, and with that composite's depth where one is asked for."""
+    canvas = paste_ball(request.canvas, median, request.ball)
+    depth = request.depth if depth_of is None else paint_depth(depth_of(canvas), request.ball)
+    return replace(request, canvas=canvas, depth=depth)
 
 
 def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:

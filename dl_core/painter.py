@@ -55,11 +55,13 @@ class PaintResult:
 
     Attributes:
         balls: (N, D, D, 3) display-encoded in [0, 1], in the order of the seeds.
-        evaluations: evaluations of the denoiser (NFE): one a ball and step, two with guidance.
+        evaluations: evaluations of the denoiser (NFE) that this took: one a ball and step, two with guidance.
+        notes: what a user should know of how it went, one sentence each: batches halved, balls of an earlier run.
     """
 
     balls: BallImage
     evaluations: int
+    notes: tuple[str, ...] = ()
 
 
 @runtime_checkable
@@ -67,7 +69,7 @@ class Observer(Protocol):
     """Hears of progress. Raising `Interrupted` from any call stops the run there."""
 
     def evaluated(self, count: int) -> None:
-        """`count` more denoiser evaluations are done."""
+        """`count` more denoiser evaluations are done; those of balls that an earlier run finished count at once."""
 
     def painted(self, ev: float, round_index: int, balls: BallImage) -> None:
         """Balls of a round are finished: all those so far, (n, D, D, 3)."""

@@ -14,6 +14,7 @@ from comfy_api.latest import io
 
 from ..dl_core.ball import Ball, paste_ball, require_canvas
 from ..dl_core.errors import ImageError
+from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
 from ..dl_core.painter import PaintRequest
 from ..dl_core.presets import PRESETS
@@ -25,6 +26,10 @@ __all__ = ["ChromeBallInpaint", "IterativeMedian"]
 
 CUSTOM: Final = "custom"
 """Preset that leaves the node's own values in force."""
+
+FINISHED: Final = FinishedBalls(256 * 2**20)
+"""Balls of the runs before, so that a graph queued again after an interrupt goes on where it was: 256 MiB hold those of
+five exposures of the paper's schedule, 61 balls each at 256 pixels."""
 
 
 def _shared_inputs() -> list[Any]:
@@ -91,10 +96,11 @@ def _sampling_inputs() -> list[Any]:
         ),
         io.Int.Input(
             "batch_size",
-            default=4,
-            min=1,
+            default=0,
+            min=0,
             max=64,
-            tooltip="Balls painted at once: more is faster while memory lasts. It does not change the balls.",
+            tooltip="Balls painted at once; 0 lets free memory decide. It does not change the balls. Where a batch "
+            "does not fit after all, it is halved, and the report says so.",
         ),
     ]
 
@@ -110,7 +116,7 @@ def _painter(observer: BarObserver, ball: Ball, mask: torch.Tensor | None, optio
         raise ImageError("mask", f"has shape {tuple(mask.shape)}; the ball's canvas is {ball.canvas} x {ball.canvas}")
     networks = Networks(**{field.name: options[field.name] for field in fields(Networks)})
     guidance = Guidance(**{field.name: options[field.name] for field in fields(Guidance)})
-    return ComfyPainter(networks, guidance, mask=mask, on_balls=observer.preview)
+    return ComfyPainter(networks, guidance, mask=mask, on_balls=observer.preview, finished=FINISHED)
 
 
 def _request(
@@ -271,9 +277,10 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
 
 
 def _report(request: PaintRequest, schedule: Rounds, result: IterativeResult, seconds: float) -> str:
-    """One line on an exposure: what was run, what it cost, how far its balls agree."""
-    return (
+    """What was run at an exposure, what it cost, how far its balls agree; one line, and one for each note."""
+    line = (
         f"EV {request.ev:g}: {schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps, "
         f"strength {schedule.strength:g}, seed {request.seeds[0]}; {result.evaluations} denoiser evaluations "
         f"in {seconds:.1f} s; mean spread {float(result.spread.mean()):.3f}"
     )
+    return "\n".join((line, *(f"EV {request.ev:g}: {note}" for note in result.notes)))

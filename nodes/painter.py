@@ -1,9 +1,10 @@
 """ComfyPainter: the Painter port on ComfyUI's own sampling.
 
 With nodes/mini.py this is the only file that touches ComfyUI's internals: `comfy.sample.sample_custom`,
-`comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules), a model's `model_function_wrapper`, `model_sampling`
-and `model_config`, a ControlNet's `copy` and `set_cond_hint`, and a VAE's `encode`, `decode`
-and `first_stage_model`.
+`comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules), `comfy.model_management` (interruption, free memory),
+a model's `model_function_wrapper`, `model_sampling`, `model_config`, `memory_required`, `model_size`, `loaded_size` and
+`patches_uuid`, a ControlNet's `copy`, `set_cond_hint` and `get_models`, and a VAE's `encode`, `decode` and
+`first_stage_model`.
 
 How it differs from the paper's Algorithm 0 in its authors' code. Outside the mask both hold the photograph's latent
 with the same initial noise at the level of every evaluation (there: put in after a step; here: before an evaluation,
@@ -14,8 +15,9 @@ sample.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import comfy.controlnet
@@ -26,7 +28,9 @@ import comfy.samplers
 import torch
 
 from ..dl_core.ball import Ball, crop_ball, disc_mask
+from ..dl_core.batches import Batches
 from ..dl_core.errors import ModelError, OptionError
+from ..dl_core.finished import FinishedBalls, content_key
 from ..dl_core.painter import Observer, PaintRequest, PaintResult, first_step
 from ..dl_core.shapes import BallImage, Image, Mask
 
@@ -47,6 +51,9 @@ batch, that exposures share their noise, and that the cost of a run is known bef
 LEADING: Final = "leading (paper)"
 SCHEDULERS: Final = (LEADING, *(name for name in comfy.samplers.KSampler.SCHEDULERS if name != "ddim_uniform"))
 """The paper's schedule, then ComfyUI's, except one that does not keep to the number of steps asked for."""
+
+MOST_AT_ONCE: Final = 16
+"""Balls of a batch that is chosen from free memory: beyond it a batch gains little, and an interrupt loses more."""
 
 PLAIN_MARGIN: Final = 4
 """Latent cells decoded around the ball: 4 change it by 0.002 of an 8-bit code with the mini model's autoencoder."""
@@ -82,21 +89,23 @@ class Guidance:
         sampler: of `SAMPLERS`.
         scheduler: of `SCHEDULERS`.
         control_strength: of the depth ControlNet; at 0 it is not evaluated.
-        batch_size: balls painted at once.
+        batch_size: balls painted at once; 0 is as many as memory allows (`_room`), up to `MOST_AT_ONCE`.
     """
 
     cfg: float = 5.0
     sampler: str = "uni_pc"
     scheduler: str = LEADING
     control_strength: float = 0.5
-    batch_size: int = 4
+    batch_size: int = 0
 
     def __post_init__(self) -> None:
         for name, value, accepted in (("sampler", self.sampler, SAMPLERS), ("scheduler", self.scheduler, SCHEDULERS)):
             if value not in accepted:
                 raise OptionError(name, value, ", ".join(accepted))
-        if self.batch_size < 1:
-            raise OptionError("batch_size", self.batch_size, "1 or more")
+        if not 1 <= self.cfg < math.inf:
+            raise OptionError("cfg", self.cfg, "1 or more; at 1 the negative prompt is left out")
+        if self.batch_size < 0:
+            raise OptionError("batch_size", self.batch_size, "1 or more, or 0 to let free memory decide")
 
 
 def leading_timesteps(steps: int, trained: int = 1000) -> list[int]:
@@ -123,6 +132,7 @@ class ComfyPainter:
         *,
         mask: Mask | None = None,
         on_balls: Callable[[BallImage], None] | None = None,
+        finished: FinishedBalls | None = None,
     ) -> None:
         """Take the graph's models.
 
@@ -131,6 +141,8 @@ class ComfyPainter:
             guidance: how to sample.
             mask: (1, S, S) where to paint; the ball's disc grown by its dilation when not given.
             on_balls: hears of the balls of a request painted so far, (n, D, D, 3), after every batch.
+            finished: balls of earlier runs, and where those painted now are kept. A ball that is there is not painted
+                again; what it cost is told to the observer and left out of the result's cost.
 
         Raises:
             ModelError: a model or conditioning of another architecture; the socket is named.
@@ -140,6 +152,8 @@ class ComfyPainter:
             _require_conditioning(socket, getattr(networks, socket), networks.model)
         self._networks, self._guidance = networks, guidance
         self._mask, self._on_balls = mask, on_balls
+        self._finished = FinishedBalls(0) if finished is None else finished
+        self._batches: Batches | None = None
 
     def evaluations(self, balls: int, steps: int, strength: float) -> int:
         """Denoiser evaluations that painting so many balls takes, exactly."""
@@ -154,19 +168,43 @@ class ComfyPainter:
         Raises:
             OptionError: a schedule the sampler cannot run.
         """
-        counter = _Counter(observer)
-        model = _watched(self._networks.model, counter)
-        latent = self._networks.vae.encode(request.canvas)
-        positive, negative = self._controlled(request)
+        counter, notes = _Counter(observer), list[str]()
         mask = self._mask if self._mask is not None else disc_mask(request.ball, grow=request.ball.dilation)
         sigmas = self._sigmas(request.steps)[first_step(request.steps, request.strength) :]
         if len(sigmas) < 3 and self._guidance.sampler.startswith("uni_pc"):
             raise OptionError(
                 "steps", request.steps, f"at least 2 steps to run with the sampler {self._guidance.sampler}"
             )
-        painted: list[BallImage] = []
-        for start in range(0, len(request.seeds), self._guidance.batch_size):
-            seeds = request.seeds[start : start + self._guidance.batch_size]
+        key = self._key(request, mask)
+        balls = self._finished.find(key, request.seeds)
+        if balls:
+            notes.append(f"{len(balls)} of {len(request.seeds)} balls taken from an earlier run")
+            observer.evaluated(self.evaluations(len(balls), request.steps, request.strength))
+        wanted = tuple(seed for seed in request.seeds if seed not in balls)
+        for seeds, painted in self._paint(request, wanted, mask, sigmas, counter, notes.append):
+            self._finished.keep(key, seeds, painted)
+            balls |= dict(zip(seeds, painted.split(1), strict=True))
+            if self._on_balls:
+                self._on_balls(torch.cat(list(balls.values())))
+        return PaintResult(torch.cat([balls[seed] for seed in request.seeds]), counter.count, tuple(notes))
+
+    def _paint(
+        self,
+        request: PaintRequest,
+        wanted: tuple[int, ...],
+        mask: Mask,
+        sigmas: torch.Tensor,
+        counter: _Counter,
+        note: Callable[[str], None],
+    ) -> Iterator[tuple[tuple[int, ...], BallImage]]:
+        """Paint the balls of the seeds wanted, batch by batch; nothing but their crops outlives a batch."""
+        if not wanted:
+            return
+        model = _watched(self._networks.model, counter)
+        latent = self._networks.vae.encode(request.canvas)
+        positive, negative = self._controlled(request)
+
+        def paint(seeds: tuple[int, ...]) -> BallImage:
             samples = comfy.sample.sample_custom(
                 model,
                 _noise(seeds, latent),
@@ -180,10 +218,35 @@ class ComfyPainter:
                 disable_pbar=True,
                 seed=seeds[0],
             )
-            painted.append(_decode_ball(self._networks.vae, samples, request.ball))
-            if self._on_balls:
-                self._on_balls(torch.cat(painted))
-        return PaintResult(torch.cat(painted), counter.count)
+            return _decode_ball(self._networks.vae, samples, request.ball)
+
+        if self._batches is None:
+            size = self._guidance.batch_size or self._room(latent)
+            self._batches = Batches(size, comfy.model_management.soft_empty_cache)
+        yield from self._batches.paint(wanted, paint, note)
+
+    def _room(self, latent: torch.Tensor) -> int:
+        """Balls that fit in free memory at once, by ComfyUI's own estimate of what the model needs.
+
+        Of the memory that is free now, weights still to be loaded and ComfyUI's own reserve are left out. What other
+        models hold counts as taken, though ComfyUI may unload them: a careful guess, and a shortage halves it.
+        """
+        model, doubled = self._networks.model, 1 if self._guidance.cfg == 1 else 2
+        each = model.memory_required([doubled, *latent.shape[1:]])
+        networks = [model, *self._networks.control_net.get_models()]
+        unloaded = sum(network.model_size() - network.loaded_size() for network in networks)
+        free = comfy.model_management.get_free_memory(model.load_device)
+        spare = free - unloaded - comfy.model_management.minimum_inference_memory()
+        return max(1, min(MOST_AT_ONCE, int(spare / each)))
+
+    def _key(self, request: PaintRequest, mask: Mask) -> str:
+        """What decides the balls of a request, but for their seeds."""
+        networks = {field.name: getattr(self._networks, field.name) for field in fields(Networks)}
+        guidance = replace(self._guidance, batch_size=0)
+        patches = getattr(self._networks.model, "patches_uuid", None)
+        # The EV reaches the ball through its conditioning alone.
+        asked = replace(request, seeds=(0,), ev=0.0)
+        return content_key(networks, str(patches), guidance, mask, asked)
 
     def _sigmas(self, steps: int) -> torch.Tensor:
         """Noise levels of a full schedule, (steps + 1,), the last one 0."""

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..ball import Ball, crop_ball, disc_mask, require_canvas
+from ..batches import Batches, is_out_of_memory
 from ..errors import ModelError, OptionError
 from ..painter import Observer, PaintRequest, PaintResult, first_step
 from ..shapes import BallImage, Image
@@ -78,7 +79,7 @@ class DiffusersPainter:
         pipeline: its networks, text encoders and scheduler configuration are used; its own call is not.
         defaults: prompts, guidance, scale of ControlNet and LoRA, and the EV of the dark prompt.
         sampler: a name of `SAMPLERS`.
-        batch: balls denoised at once; less memory with less.
+        batch: balls denoised at once; less memory with less. Where a batch does not fit, it is halved from there on.
         impute: noise put on what lies outside the mask (see the module).
     """
 
@@ -102,7 +103,7 @@ class DiffusersPainter:
         self.pipeline = pipeline
         self.defaults = defaults
         self.sampler = sampler
-        self.batch = batch
+        self._batches = Batches(batch, _empty_cache)
         self.impute = impute
         self._embeddings: dict[str, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
 
@@ -159,21 +160,37 @@ class DiffusersPainter:
 
         Raises:
             ImageError: the canvas has not the size the ball was placed on.
+            ModelError: the model does not fit in memory even with one ball at once.
         """
         require_canvas(request.canvas, request.ball)
-        balls, spent = [], 0
+        spent, notes = list[int](), list[str]()
         encoded = self._encode(request.canvas)
-        for start in range(0, len(request.seeds), self.batch):
-            seeds = request.seeds[start : start + self.batch]
-            latents, evaluations = self._inpaint(request, encoded, seeds, observer)
-            balls.append(self._decode_ball(latents, request.ball))
-            spent += evaluations
-        return PaintResult(torch.cat(balls), spent)
+
+        def counted(evaluations: int) -> None:
+            spent.append(evaluations)
+            observer.evaluated(evaluations)
+
+        def paint(seeds: tuple[int, ...]) -> BallImage:
+            return self._decode_ball(self._inpaint(request, encoded, seeds, counted), request.ball)
+
+        try:
+            balls = torch.cat([balls for _, balls in self._batches.paint(request.seeds, paint, notes.append)])
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            reason = (
+                f"does not fit in the memory of {self._device} with one ball of {request.ball.canvas} pixels' canvas"
+            )
+            raise ModelError("model", f"{reason}: free memory there, or take a smaller canvas") from error
+        return PaintResult(balls, sum(spent), tuple(notes))
 
     def _inpaint(
-        self, request: PaintRequest, encoded: Any, seeds: tuple[int, ...], observer: Observer
-    ) -> tuple[Tensor, int]:
-        """Algorithm 0 for a batch of balls; returns latents (n, 4, h, w) and the denoiser evaluations spent."""
+        self, request: PaintRequest, encoded: Any, seeds: tuple[int, ...], counted: Callable[[int], None]
+    ) -> Tensor:
+        """Algorithm 0 for a batch of balls; returns latents (n, 4, h, w).
+
+        `counted` hears of the denoiser evaluations of each step.
+        """
         scheduler = SAMPLERS[self.sampler](self.pipeline.scheduler.config)
         scheduler.set_timesteps(request.steps, device=self._device)
         begin = first_step(request.steps, request.strength)
@@ -199,8 +216,8 @@ class DiffusersPainter:
             last = i + 1 == len(timesteps)
             known = clean if last else scheduler.add_noise(clean, known_noise, timesteps[i + 1].expand(len(seeds)))
             latents = (1 - mask) * known + mask * latents
-            observer.evaluated(per_step)
-        return latents, per_step * len(timesteps)
+            counted(per_step)
+        return latents
 
     def _encode(self, canvas: Image) -> Any:
         """What the autoencoder makes of the canvas: latents, or a distribution to sample them from."""
@@ -293,6 +310,11 @@ class DiffusersPainter:
     @property
     def _device(self) -> torch.device:
         return self.pipeline.unet.device
+
+
+def _empty_cache() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
 
 
 def _predicted_noise(scheduler: Any, predicted: Tensor, latents: Tensor, timestep: Tensor) -> Tensor:

@@ -152,3 +152,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A real server, shared by the tests of this folder."""
     with serve(tmp_path_factory.mktemp("server") / "base") as running:
         yield running
+
+
+@pytest.fixture(autouse=True)
+def _no_finished_balls() -> None:
+    """Every test starts with nothing painted, as after a start of ComfyUI."""
+    if installed():
+        pack_module("nodes.inpaint").FINISHED.clear()

@@ -228,7 +228,8 @@ def test_progress_counts_evaluations_and_shows_the_median(
     ("change", "message"),
     [
         ({"steps": 1}, "steps is 1.*at least 2 steps"),
-        ({"batch_size": 0}, "batch_size is 0"),
+        ({"batch_size": -1}, "batch_size is -1"),
+        ({"cfg": 0.0}, r"cfg is 0\.0.*1 or more"),
         ({"sampler": "dpmpp_sde"}, "sampler is 'dpmpp_sde'.*uni_pc"),
         ({"count": 0}, "balls is 0.*1 or more"),
         ({"strength": 0.01}, r"strength is 0\.01.*at least 0\.5 with 2 steps"),
