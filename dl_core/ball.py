@@ -20,7 +20,21 @@ from torch import Tensor
 from .errors import ImageError, OptionError
 from .shapes import BallImage, Image, Mask
 
-__all__ = ["Ball", "crop_ball", "disc_mask", "fit_canvas", "paint_depth", "paste_ball", "place_ball", "require_canvas"]
+__all__ = [
+    "Ball",
+    "Frame",
+    "crop_ball",
+    "disc_mask",
+    "fit_canvas",
+    "paint_depth",
+    "paste_ball",
+    "paste_on_photograph",
+    "photograph_disc",
+    "photograph_frame",
+    "place_ball",
+    "require_canvas",
+    "unfit_canvas",
+]
 
 
 @dataclass(frozen=True)
@@ -84,6 +98,40 @@ def _first_pixel(name: str, centre: float | None, canvas: int, diameter: int) ->
     return round(start)
 
 
+@dataclass(frozen=True)
+class Frame:
+    """Where a photograph lies on its canvas; the rest is black bars.
+
+    Attributes:
+        left: column of its first pixel.
+        top: row of its first pixel.
+        width: pixels of the canvas it covers.
+        height: pixels of the canvas it covers.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    def cut(self, canvas_image: Image) -> Float[Tensor, "b rows columns c"]:
+        """The photograph's part of (B, canvas, canvas, C), as a view."""
+        return canvas_image[:, self.top : self.top + self.height, self.left : self.left + self.width]
+
+
+def photograph_frame(height: int, width: int, canvas: int) -> Frame:
+    """Where `fit_canvas` puts a photograph of a size: as large as fits, in the middle.
+
+    Raises:
+        ImageError: an empty photograph.
+    """
+    if height < 1 or width < 1:
+        raise ImageError("image", f"is empty ({width} x {height})")
+    scale = canvas / max(height, width)
+    fitted_height, fitted_width = (max(1, round(side * scale)) for side in (height, width))
+    return Frame((canvas - fitted_width) // 2, (canvas - fitted_height) // 2, fitted_width, fitted_height)
+
+
 def fit_canvas(image_ldr: Image, canvas: int) -> Float[Tensor, "b side side c"]:
     """Fit a photograph into a square canvas, keeping its aspect, with black bars (Lanczos, as the authors' code).
 
@@ -97,16 +145,31 @@ def fit_canvas(image_ldr: Image, canvas: int) -> Float[Tensor, "b side side c"]:
     Raises:
         ImageError: an empty picture.
     """
-    height, width = image_ldr.shape[1:3]
-    if height < 1 or width < 1:
-        raise ImageError("image", f"is empty ({width} x {height})")
-    scale = canvas / max(height, width)
-    fitted_height, fitted_width = (max(1, round(side * scale)) for side in (height, width))
+    frame = photograph_frame(*image_ldr.shape[1:3], canvas)
     result = torch.zeros(image_ldr.shape[0], canvas, canvas, image_ldr.shape[3])
-    top, left = (canvas - fitted_height) // 2, (canvas - fitted_width) // 2
-    resized = _lanczos(image_ldr, fitted_height, fitted_width)
-    result[:, top : top + fitted_height, left : left + fitted_width] = resized.clamp(0, 1)
+    frame.cut(result).copy_(_lanczos(image_ldr, frame.height, frame.width).clamp(0, 1))
     return result.to(image_ldr.device)
+
+
+def unfit_canvas(canvas_image: Image, height: int, width: int) -> Float[Tensor, "b height width c"]:
+    """Undo `fit_canvas`: cut a photograph out of its canvas and give it its own size again (Lanczos).
+
+    Args:
+        canvas_image: (B, canvas, canvas, C) in [0, 1].
+        height: of the photograph in pixels.
+        width: of the photograph in pixels.
+
+    Returns:
+        (B, height, width, C) in [0, 1]. What the canvas had fewer pixels for stays lost; `paste_on_photograph` takes it
+        from the photograph.
+
+    Raises:
+        ImageError: a canvas that is not square, or an empty photograph.
+    """
+    if canvas_image.shape[1] != canvas_image.shape[2]:
+        raise ImageError("canvas", f"is {canvas_image.shape[2]} x {canvas_image.shape[1]} pixels; a square is accepted")
+    frame = photograph_frame(height, width, canvas_image.shape[1])
+    return _lanczos(frame.cut(canvas_image), height, width).clamp(0, 1).to(canvas_image.device)
 
 
 def _lanczos(image: Image, height: int, width: int) -> Float[Tensor, "b rows columns c"]:
@@ -178,6 +241,49 @@ def paste_ball(image: Image, crop: Float[Tensor, "n d d c"], ball: Ball) -> Imag
     window = crop_ball(result, ball)
     window.copy_(window * (1 - disc) + crop.to(image) * disc)
     return result
+
+
+def photograph_disc(ball: Ball, height: int, width: int) -> Mask:
+    """The ball's disc in the frame of the photograph that was fitted on its canvas.
+
+    Args:
+        ball: on the canvas; what of it lies on the bars is cut off.
+        height: of the photograph in pixels.
+        width: of the photograph in pixels.
+
+    Returns:
+        (1, height, width): 1 inside, 0 outside, and a ramp one pixel of the photograph wide across the edge.
+
+    Raises:
+        ImageError: an empty photograph.
+    """
+    frame = photograph_frame(height, width, ball.canvas)
+    x, y = ball.centre
+    # In pixels of the photograph: rounding to whole pixels of the canvas scales rows and columns a little apart.
+    across, down = width / frame.width, height / frame.height
+    columns = (torch.arange(width) + 0.5) / across + frame.left - x
+    rows = (torch.arange(height) + 0.5) / down + frame.top - y
+    inside = ball.diameter / 2 - torch.hypot(columns[None, :], rows[:, None])
+    return (inside * math.sqrt(across * down) + 0.5).clamp(0, 1)[None]
+
+
+def paste_on_photograph(photo: Image, canvas_image: Float[Tensor, "n side side c"], ball: Ball) -> Image:
+    """Paste the ball of a canvas image on the photograph, at the photograph's own size.
+
+    Args:
+        photo: (1 or B, H, W, C) in [0, 1], as it was before `fit_canvas`.
+        canvas_image: (B or 1, canvas, canvas, C) in [0, 1] that shows the ball.
+        ball: where it sits on the canvas.
+
+    Returns:
+        (B, H, W, C). Outside the ball's disc every pixel is the photograph's own.
+
+    Raises:
+        ImageError: a canvas of another size than the ball's, or an empty photograph.
+    """
+    height, width = photo.shape[1:3]
+    framed = unfit_canvas(require_canvas(canvas_image, ball), height, width).to(photo)
+    return torch.lerp(photo, framed, photograph_disc(ball, height, width)[..., None].to(photo))
 
 
 def require_canvas(image: Image, ball: Ball) -> Float[Tensor, "b h w c"]:

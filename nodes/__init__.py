@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from comfy_api.latest import ComfyExtension, io
 
-from .depth_ball import DepthBallMask
+from .depth_ball import CanvasToImage, DepthBallMask
 from .envmap_files import LoadEnvMap, SaveEnvMap
 from .equirect import BallToEquirect, EquirectToBall
 from .exposure import EVPromptInterp, HDRMerge
@@ -19,6 +19,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     EVPromptInterp,
     ChromeBallInpaint,
     IterativeMedian,
+    CanvasToImage,
     HDRMerge,
     BallToEquirect,
     EquirectToBall,

@@ -1,15 +1,25 @@
-"""DepthBallMask: the photograph on its canvas, and where the ball goes."""
+"""DepthBallMask and CanvasToImage: the photograph on its canvas, where the ball goes, and the way back."""
 
 from __future__ import annotations
 
 import torch
 from comfy_api.latest import io
 
-from ..dl_core.ball import disc_mask, fit_canvas, paint_depth, place_ball
+from ..dl_core.ball import (
+    Ball,
+    disc_mask,
+    fit_canvas,
+    paint_depth,
+    paste_on_photograph,
+    photograph_disc,
+    place_ball,
+    require_canvas,
+    unfit_canvas,
+)
 from ..dl_core.estimate import check_photograph
 from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 
-__all__ = ["DepthBallMask"]
+__all__ = ["CanvasToImage", "DepthBallMask"]
 
 AUTOMATIC = -1
 """Widget value that stands for "not given": ComfyUI's number widgets cannot be empty."""
@@ -101,3 +111,37 @@ class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
 
 def _given(value: int) -> int | None:
     return None if value == AUTOMATIC else value
+
+
+class CanvasToImage(io.ComfyNode):  # type: ignore[misc]
+    """Undoes the fitting of a photograph on its canvas."""
+
+    @classmethod
+    def define_schema(cls) -> io.Schema:
+        """Sockets of the node."""
+        return io.Schema(
+            node_id="CanvasToImage",
+            display_name="Canvas To Image",
+            category=CATEGORY,
+            description="Undoes Depth Ball Mask: brings what was painted on the canvas back to the photograph's frame "
+            "and size. Outside the ball every pixel is the photograph's own.",
+            inputs=[
+                io.Image.Input("canvas_image", tooltip="A canvas with the ball: the composite of a node that paints."),
+                io.Image.Input("image", tooltip="The photograph, as it went into Depth Ball Mask."),
+                BallSocket.Input("ball", tooltip="Where the ball sits on the canvas."),
+            ],
+            outputs=[
+                named_output(io.Image, "image", "The photograph at its own size, with the ball pasted in."),
+                named_output(io.Image, "framed", "The canvas without its bars at the photograph's size, resampled."),
+                named_output(io.Mask, "mask", "The ball's disc in the photograph's frame, with a soft edge."),
+            ],
+        )
+
+    @classmethod
+    def execute(cls, canvas_image: torch.Tensor, image: torch.Tensor, ball: Ball) -> io.NodeOutput:
+        """Cut, resize, paste."""
+        photo = check_photograph(as_rgb(image, "image"))
+        composite = require_canvas(as_rgb(canvas_image, "canvas_image"), ball)
+        height, width = photo.shape[1:3]
+        pasted = paste_on_photograph(photo, composite, ball)
+        return io.NodeOutput(pasted, unfit_canvas(composite, height, width), photograph_disc(ball, height, width))

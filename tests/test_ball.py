@@ -10,7 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tolerances import assert_close
 
-from dl_core.ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, paste_ball, place_ball, require_canvas
+from dl_core.ball import (
+    Ball,
+    crop_ball,
+    disc_mask,
+    fit_canvas,
+    paint_depth,
+    paste_ball,
+    paste_on_photograph,
+    photograph_disc,
+    photograph_frame,
+    place_ball,
+    require_canvas,
+    unfit_canvas,
+)
 from dl_core.errors import ImageError, OptionError
 
 
@@ -154,3 +167,87 @@ def test_pasting_a_crop_back_changes_nothing(generator: torch.Generator) -> None
 def test_another_canvas_is_refused_with_both_sizes() -> None:
     with pytest.raises(ImageError, match=r"40 x 48.*64 x 64"):
         require_canvas(torch.ones(1, 48, 40, 3), place_ball(64, 16))
+
+
+# --- from the canvas back to the photograph ----------------------------------------------------------------------
+
+sides = st.integers(1, 300)
+
+
+@given(sides, sides)
+def test_fitting_is_undone_for_any_size(height: int, width: int) -> None:
+    """A flat photograph comes back flat: no bar bleeds into it, at any size and aspect."""
+    photo = torch.tensor([0.25, 0.5, 0.75]).expand(1, height, width, 3)
+    again = unfit_canvas(fit_canvas(photo, 64), height, width)
+    assert again.shape == photo.shape
+    assert_close(again, photo)
+
+
+def test_a_photograph_of_the_canvas_size_is_not_resampled() -> None:
+    photo = torch.rand(2, 40, 64, 3, generator=torch.Generator().manual_seed(0))
+    canvas = fit_canvas(photo, 64)
+    assert torch.equal(canvas[:, 12:52], photo)
+    assert torch.equal(unfit_canvas(canvas, 40, 64), photo)
+
+
+@pytest.mark.parametrize(("height", "width"), [(60, 96), (96, 60), (150, 240), (37, 240)])
+def test_a_smooth_photograph_comes_back(height: int, width: int) -> None:
+    """A wave of one period over the picture lies far below what the canvas of 128 pixels can carry."""
+    rows, columns = torch.linspace(0, 2 * math.pi, height), torch.linspace(0, 2 * math.pi, width)
+    wave = 0.5 + 0.2 * rows.sin()[:, None] + 0.2 * columns.cos()[None, :]
+    photo = wave[None, ..., None].expand(-1, -1, -1, 3)
+    again = unfit_canvas(fit_canvas(photo, 128), height, width)
+    # At the border, three pixels of the canvas wide, a filter of six samples lacks some. Within, it does better than
+    # lines between the canvas pixels would, of which the narrowest picture has 20: at most f'' / 8 away from the wave.
+    border = math.ceil(3 * max(height, width) / 128)
+    inner = (slice(None), slice(border, -border), slice(border, -border))
+    assert (again - photo)[inner].abs().max() < 0.2 * (2 * math.pi / 20) ** 2 / 8
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (1000, 300), (256, 256), (100, 100)])
+def test_the_disc_on_the_photograph_is_the_ball_at_its_scale(height: int, width: int) -> None:
+    ball = place_ball(256, 48, x=130, y=120)
+    disc, scale = photograph_disc(ball, height, width)[0], max(height, width) / 256
+    area, perimeter = math.pi * (24 * scale) ** 2, 2 * math.pi * 24 * scale
+    # A ramp across the edge leaves an error of order 1 / 12 a pixel of the perimeter; rounding of the frame's sides to
+    # whole canvas pixels another half pixel of 76, the narrowest, in one direction.
+    assert float(disc.sum()) == pytest.approx(area, abs=perimeter / 12 + area * 0.5 / 76)
+    frame = photograph_frame(height, width, 256)
+    centre = [
+        float((disc.sum(dim=1 - axis) * (torch.arange(side) + 0.5)).sum() / disc.sum())
+        for axis, side in enumerate((height, width))
+    ]
+    wanted = [(120 - frame.top) * height / frame.height, (130 - frame.left) * width / frame.width]
+    assert centre == pytest.approx(wanted, abs=0.05)
+
+
+def test_only_the_ball_comes_from_the_canvas() -> None:
+    photo = torch.rand(1, 90, 160, 3, generator=torch.Generator().manual_seed(0))
+    ball = place_ball(64, 20, x=40, y=30)
+    red = torch.tensor([1.0, 0.0, 0.0])
+    composite = paste_ball(fit_canvas(photo, 64), red.expand(1, 20, 20, 3), ball)
+    pasted = paste_on_photograph(photo, composite.expand(2, -1, -1, -1), ball)
+    disc = photograph_disc(ball, 90, 160)[0]
+    assert pasted.shape == (2, 90, 160, 3)
+    assert torch.equal(pasted[:, disc == 0], photo.expand(2, -1, -1, -1)[:, disc == 0])
+    # Lanczos reaches three pixels of the canvas, 7.5 of the photograph, from the edge of the disc inwards.
+    rows, columns = torch.meshgrid(torch.arange(90) + 0.5, torch.arange(160) + 0.5, indexing="ij")
+    deep = torch.hypot(columns - 40 * 2.5, rows - (30 - 14) * 2.5) < 25 - 3.5 * 2.5
+    assert deep.sum() > 500
+    assert_close(pasted[0, deep], red.expand(int(deep.sum()), 3))
+
+
+def test_a_ball_on_the_bars_is_cut_off() -> None:
+    """A canvas of 128 shows a photograph of half the height in its middle; the ball stands on its lower border."""
+    ball = place_ball(128, 32, y=96)
+    assert float(photograph_disc(ball, 64, 128).sum()) == pytest.approx(math.pi * 16**2 / 2, rel=0.02)
+
+
+def test_a_canvas_that_is_not_the_balls_is_refused() -> None:
+    photo = torch.rand(1, 8, 8, 3)
+    with pytest.raises(ImageError, match=r"is 64 x 64 pixels.*128 x 128"):
+        paste_on_photograph(photo, torch.rand(1, 64, 64, 3), place_ball(128, 32))
+    with pytest.raises(ImageError, match=r"canvas: is 32 x 64 pixels; a square"):
+        unfit_canvas(torch.rand(1, 64, 32, 3), 8, 8)
+    with pytest.raises(ImageError, match=r"is empty \(0 x 4\)"):
+        unfit_canvas(torch.rand(1, 64, 64, 3), 4, 0)

@@ -70,9 +70,12 @@ def interrupted(node: Nodes, graph: Any, scene: Any, at: int) -> int:
     """Run until the user interrupts during the evaluation of picture `at`; pictures evaluated in all."""
     import comfy.model_management as host
 
-    with watched(graph, lambda count, batch: host.interrupt_current_processing() if count >= at else None) as counted:
-        with pytest.raises(host.InterruptProcessingException):
-            run(node, graph, scene)
+    def stop(count: int, batch: int) -> None:
+        if count >= at:
+            host.interrupt_current_processing()
+
+    with watched(graph, stop) as counted, pytest.raises(host.InterruptProcessingException):
+        run(node, graph, scene)
     return counted.count
 
 

@@ -72,6 +72,7 @@ def test_odd_sizes_work(node: Nodes, size: tuple[int, int]) -> None:
         ({"x": 10}, r"x is 10.*32 to 224"),
         ({"y": 250}, r"y is 250.*32 to 224"),
         ({"canvas": 100}, r"canvas is 100.*multiple of 8"),
+        ({"canvas": 56}, r"canvas is 56.*at least 64"),
         ({"dilation": 200}, r"dilation is 200.*0 to 128"),
     ],
 )
@@ -101,6 +102,30 @@ def test_depth_with_nan_is_refused(node: Nodes) -> None:
     place = {"canvas": 64, "diameter": 16, "x": -1, "y": -1, "dilation": -1}
     with pytest.raises(errors().ImageError, match="depth: holds NaN"):
         node("DepthBallMask").execute(torch.rand(1, 8, 8, 3), depth=torch.full((1, 8, 8, 3), math.nan), **place)
+
+
+# --- CanvasToImage -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_canvas_comes_back_at_the_photographs_size(node: Nodes, channels: int) -> None:
+    photo = torch.rand(1, 50, 90, channels)
+    place = {"canvas": 64, "diameter": 20, "x": 40, "y": 30, "dilation": -1}
+    canvas, _, _, ball = node("DepthBallMask").execute(photo, **place).args
+    composite = pack_module("dl_core.ball").paste_ball(canvas, torch.ones(1, 20, 20, 3), ball).expand(2, -1, -1, -1)
+    pasted, framed, mask = node("CanvasToImage").execute(composite, photo, ball).args
+    assert pasted.shape == framed.shape == (2, 50, 90, 3)
+    assert mask.shape == (1, 50, 90)
+    own = photo.expand(-1, -1, -1, 3) if channels == 1 else photo[..., :3]
+    assert torch.equal(pasted[0][mask[0] == 0], own[0][mask[0] == 0])
+    # The ball's centre, in pixels of the photograph.
+    assert pasted[:, round((30 - 14) * 90 / 64), round(40 * 90 / 64)].min() == 1
+
+
+def test_canvas_of_another_ball_is_refused(node: Nodes) -> None:
+    ball = pack_module("dl_core.ball").place_ball(64, 20)
+    with pytest.raises(errors().ImageError, match=r"is 32 x 32 pixels.*64 x 64"):
+        node("CanvasToImage").execute(torch.rand(1, 32, 32, 3), torch.rand(1, 8, 8, 3), ball)
 
 
 # --- EVPromptInterp ----------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ SOCKETS = {
         "model positive negative vae control_net image depth ball mask ev",
         "ball median spread composite report",
     ),
+    "CanvasToImage": ("canvas_image image ball", "image framed mask"),
     "HDRMerge": ("balls ev report", "hdr report"),
     "BallToEquirect": ("image ball", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),
