@@ -267,7 +267,9 @@ def photograph_disc(ball: Ball, height: int, width: int) -> Mask:
     return (inside * math.sqrt(across * down) + 0.5).clamp(0, 1)[None]
 
 
-def paste_on_photograph(photo: Image, canvas_image: Float[Tensor, "n side side c"], ball: Ball) -> Image:
+def paste_on_photograph(
+    photo: Image, canvas_image: Float[Tensor, "n side side c"], ball: Ball
+) -> Float[Tensor, "m h w c"]:
     """Paste the ball of a canvas image on the photograph, at the photograph's own size.
 
     Args:

@@ -112,19 +112,23 @@ def test_progress_of_a_resumed_run_fills_the_bar(
 
 @pytest.mark.parametrize("change", ["seed", "cfg", "sampler", "scheduler", "control_strength", "positive", "image"])
 def test_what_changes_the_balls_is_painted_anew(node: Nodes, graph: Any, scene: Any, change: str) -> None:
-    run(node, graph, scene)
+    run(node, graph, scene, rounds=0)
     tokens, options = graph.positive[0]
     values = {"seed": 100, "cfg": 4.0, "sampler": "euler", "scheduler": "normal", "control_strength": 0.25}
     values |= {"positive": [[tokens * 1.01, options]], "image": scene.canvas * 0.99}
-    assert f"{RUN_COST} denoiser evaluations" in run(node, graph, scene, **{change: values[change]})[4]
+    report = run(node, graph, scene, rounds=0, **{change: values[change]})[4]
+    assert f"; {BALL_COST} denoiser evaluations" in report
+    # And what has not changed is found.
+    assert "; 0 denoiser evaluations" in run(node, graph, scene, rounds=0)[4]
 
 
 def test_a_patched_model_paints_anew(node: Nodes, graph: Any, scene: Any) -> None:
     """A clone shares its weights, and its patches' name, with the model it is of; only its options differ here."""
-    run(node, graph, scene)
+    run(node, graph, scene, rounds=0)
     patched = graph.model.clone()
     patched.set_model_sampler_cfg_function(lambda arguments: arguments["cond"])
-    assert f"{RUN_COST} denoiser evaluations" in run(node, replace(graph, model=patched), scene)[4]
+    report = run(node, replace(graph, model=patched), scene, rounds=0)[4]
+    assert f"; {BALL_COST} denoiser evaluations" in report
 
 
 def test_more_balls_paint_only_the_ones_that_are_new(node: Nodes, graph: Any, scene: Any) -> None:
