@@ -5,6 +5,7 @@ Source: DiffusionLight, Fig. 2 (overview) and Sec. 4.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -102,6 +103,7 @@ def estimate(
     settings: Settings,
     *,
     depth: Float[Tensor, "1 y x k"] | None = None,
+    depth_of: Callable[[Image], Image] | None = None,
     observer: Observer | None = None,
 ) -> Probe:
     """Estimate the light of a photograph.
@@ -110,7 +112,10 @@ def estimate(
         photo_ldr: (1, H, W, 3) display-encoded in [0, 1], any size.
         painter: paints the balls.
         settings: schedule, bracket, seed and sizes.
-        depth: (1, h, w, 1 or 3) depth of the photograph, near is bright; without it the scene counts as far away.
+        depth: (1, h, w, 1 or 3) depth of the photograph, near is bright; without it the scene counts as far away, or is
+            as far as `depth_of` finds it.
+        depth_of: depth of a canvas, as `depth.DepthModel` gives it. With it depth is estimated again for every round,
+            on the composite with the last median, as in the authors' code.
         observer: hears of progress; may stop the run by raising `Interrupted`.
 
     Raises:
@@ -125,10 +130,12 @@ def estimate(
         raise OptionError("height", settings.height, "2 or more rows")
     ball = place_ball(settings.canvas, settings.diameter, x=settings.x, y=settings.y)
     canvas = fit_canvas(photo_ldr, settings.canvas)
+    if depth is None and depth_of is not None:
+        depth = depth_of(canvas)
     control = paint_depth(depth, ball)
+    requests = [PaintRequest(canvas, control, ball, ev, (settings.seed,)) for ev in evs]
     exposures = tuple(
-        iterative_inpaint(painter, PaintRequest(canvas, control, ball, ev, (settings.seed,)), settings.rounds, observer)
-        for ev in evs
+        iterative_inpaint(painter, request, settings.rounds, observer, depth_of=depth_of) for request in requests
     )
     ball_hdr = merge_bracket([exposure.ball for exposure in exposures], evs, settings.merge)
     return Probe(

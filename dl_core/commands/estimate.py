@@ -21,7 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--evs", metavar="0,-2.5,-5", help="exposures, descending from 0 (default: the preset's)")
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
     add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
-    add("--depth", metavar="FILE", help="depth of the photograph as a picture, near is bright (default: all far)")
+    add(
+        "--depth",
+        metavar="FILE|FOLDER",
+        help="depth of the photograph as a picture, near is bright; or the folder of a depth model of transformers', "
+        "which then estimates depth anew for every round (default: all far)",
+    )
     add("--diameter", type=int, help="of the ball in canvas pixels (default: the model's)")
     add("--x", type=float, help="column of the ball's centre on the canvas (default: the middle)")
     add("--y", type=float, help="row of the ball's centre on the canvas (default: the middle)")

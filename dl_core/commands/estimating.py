@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import torch
 from tqdm import tqdm
 
 from .. import __version__
 from ..backends.loading import ModelFiles, choose_backend
+from ..depth import load_depth_model
 from ..errors import OptionError
 from ..estimate import Probe, Settings, estimate, planned_evaluations
 from ..exposure import check_evs, check_merge
@@ -84,7 +86,7 @@ def run(args: argparse.Namespace) -> None:
         raise OptionError("height", args.height, "2 to 4096 rows")
     outputs.require_writable([Path(name) for name in (args.photo, args.depth) if name is not None])
     photo = read_photograph(args.photo)
-    depth = None if args.depth is None else read_photograph(args.depth)
+    depth, depth_of = _depth(args.depth)
     loaded = backend.load(ModelFiles.of(args))
     settings = Settings(
         rounds=chosen.rounds,
@@ -98,10 +100,19 @@ def run(args: argparse.Namespace) -> None:
         height=args.height,
     )
     painting = time.perf_counter()
-    probe = _paint(photo, loaded.painter, settings, depth)
+    probe = _paint(photo, loaded.painter, settings, depth, depth_of)
     painted = time.perf_counter()
     written = _write(outputs, probe, {"lightprobe:preset": args.preset, "lightprobe:backend": args.backend})
     _report(args, probe, written, {"total": time.perf_counter() - start, "painting": painted - painting})
+
+
+def _depth(name: str | None) -> tuple[Image | None, Callable[[Image], Image] | None]:
+    """A depth map from a picture, or what estimates it from a model's folder."""
+    if name is None:
+        return None, None
+    if Path(name).is_dir():
+        return None, load_depth_model(name, device="cuda" if torch.cuda.is_available() else "cpu")
+    return read_photograph(name), None
 
 
 def _parse_evs(text: str) -> tuple[float, ...]:
@@ -113,9 +124,15 @@ def _parse_evs(text: str) -> tuple[float, ...]:
         raise OptionError("evs", text, "numbers and commas, such as 0,-2.5,-5") from error
 
 
-def _paint(photo: Image, painter: Painter, settings: Settings, depth: Image | None) -> Probe:
+def _paint(
+    photo: Image,
+    painter: Painter,
+    settings: Settings,
+    depth: Image | None,
+    depth_of: Callable[[Image], Image] | None,
+) -> Probe:
     with tqdm(total=planned_evaluations(painter, settings), unit="eval", desc="denoising", file=sys.stderr) as bar:
-        return estimate(photo, painter, settings, depth=depth, observer=_Progress(bar))
+        return estimate(photo, painter, settings, depth=depth, depth_of=depth_of, observer=_Progress(bar))
 
 
 def probe_metadata(probe: Probe) -> dict[str, str]:
@@ -145,6 +162,11 @@ def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]
 
 def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds: dict[str, float]) -> None:
     memory = _peak_memory()
+    notes = [
+        f"EV {ev:g}: {note}"
+        for ev, exposure in zip(probe.settings.evs, probe.exposures, strict=True)
+        for note in exposure.notes
+    ]
     if args.json:
         report = {
             "written": [str(path) for path in written],
@@ -157,11 +179,14 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
             "evs": list(probe.settings.evs),
             "seed": args.seed,
             "version": __version__,
+            "notes": notes,
         }
         print(json.dumps(report, indent=2))
         return
     for path, what in zip(written, ("environment map", "ball at EV 0", "ball, map and spheres"), strict=True):
         print(f"{path}  ({what}, {path.stat().st_size / 1e3:.0f} kB)")
+    for note in notes:
+        print(note)
     peak = "" if memory is None else f", {memory / 2**30:.2f} GiB at the peak"
     took = f"{seconds['painting']:.1f} s, {seconds['total']:.1f} s in all"
     print(f"{probe.evaluations} denoiser evaluations in {took}{peak}")

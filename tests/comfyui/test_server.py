@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import pytest
 from comfy_host import REPOSITORY, Server, pack_module
 
@@ -173,3 +175,45 @@ def test_interruption_ends_the_run_within_a_step(server: Server) -> None:
     kinds = [kind for kind, _ in entry["status"]["messages"]]
     assert "execution_interrupted" in kinds
     assert not entry["outputs"] or all("envmaps" not in output for output in entry["outputs"].values())
+
+
+def interrupt_at(server: Server, prompt: dict[str, Any], evaluations: int) -> dict[str, Any]:
+    """Queue a prompt, interrupt it once its last exposure is so far; its entry of the history."""
+
+    async def follow() -> str:
+        async with aiohttp.ClientSession() as session, session.ws_connect(f"{server.url}/ws?clientId=test") as socket:
+            body = {"prompt": prompt, "client_id": "test"}
+            async with session.post(f"{server.url}/prompt", json=body) as answer:
+                prompt_id = (await answer.json())["prompt_id"]
+            bars, value = 0, 0
+            async for message in socket:
+                event = json.loads(message.data) if message.type == aiohttp.WSMsgType.TEXT else {}
+                if event.get("type") == "progress":
+                    bars += event["data"]["value"] == 0 or event["data"]["value"] < value
+                    value = event["data"]["value"]
+                    if bars == 2 and value >= evaluations:
+                        async with session.post(f"{server.url}/interrupt", json={}):
+                            return prompt_id
+        raise AssertionError("the connection ended before the run was so far")
+
+    return server.wait(asyncio.run(asyncio.wait_for(follow(), 120)), timeout=60)
+
+
+def test_a_graph_queued_again_goes_on_where_it_was_interrupted(server: Server) -> None:
+    """ComfyUI keeps what ran before the interrupted node, so the models are the same objects in the second run."""
+    prompt = workflow("mini_quickstart")
+    for node in prompt.values():
+        if node["class_type"] == "IterativeMedian":
+            node["inputs"] |= {"preset": "custom", "balls": 3, "rounds": 1, "steps": 4, "final": False}
+            node["inputs"] |= {"batch_size": 1, "seed": 31}
+    each = 4 * 2
+    entry = interrupt_at(server, prompt, 2 * each)
+    assert "execution_interrupted" in [kind for kind, _ in entry["status"]["messages"]]
+    entry = server.run(prompt)
+    (saved,) = [output["envmaps"][0] for output in entry["outputs"].values() if "envmaps" in output]
+    path = server.base / "output" / saved["subfolder"] / saved["filename"]
+    report = pack_module("dl_core.imageio").read_exr_header(path)["lightprobe"]
+    assert "EV 0: 3 of 3 balls taken from an earlier run" in report
+    assert "EV -2.5: 2 of 3 balls taken from an earlier run" in report
+    assert "EV -5: 3 balls" in report
+    assert "EV -5: 3 of 3" not in report
