@@ -5,6 +5,7 @@ from __future__ import annotations
 from comfy_api.latest import ComfyExtension, io
 
 from .depth_ball import CanvasToImage, DepthBallMask
+from .depth_model import EstimateDepth
 from .envmap_files import LoadEnvMap, SaveEnvMap
 from .equirect import BallToEquirect, EquirectToBall
 from .exposure import EVPromptInterp, HDRMerge
@@ -15,6 +16,7 @@ __all__ = ["NODES", "LightProbeExtension"]
 
 NODES: tuple[type[io.ComfyNode], ...] = (
     MiniProbeLoader,
+    EstimateDepth,
     DepthBallMask,
     EVPromptInterp,
     ChromeBallInpaint,

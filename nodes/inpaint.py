@@ -13,6 +13,7 @@ import torch
 from comfy_api.latest import io
 
 from ..dl_core.ball import Ball, paste_ball, require_canvas
+from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ImageError
 from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
@@ -20,7 +21,7 @@ from ..dl_core.painter import PaintRequest
 from ..dl_core.presets import PRESETS
 from .painter import SAMPLERS, SCHEDULERS, ComfyPainter, Guidance, Networks
 from .progress import BarObserver
-from .sockets import CATEGORY, BallSocket, as_rgb, named_output
+from .sockets import CATEGORY, BallSocket, DepthModelSocket, as_rgb, named_output
 
 __all__ = ["ChromeBallInpaint", "IterativeMedian"]
 
@@ -236,6 +237,13 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                     "is the answer: cheaper and softer.",
                 ),
                 *_sampling_inputs(),
+                # Last, so that saved workflows keep the order of their widgets.
+                DepthModelSocket.Input(
+                    "depth_model",
+                    optional=True,
+                    tooltip="Of Estimate Depth: estimates depth again on every median, as the authors' code does. "
+                    "Without one all rounds use depth.",
+                ),
             ],
             outputs=[
                 named_output(io.Image, "ball", "The answer, cut out, display-encoded."),
@@ -261,6 +269,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         steps: int,
         mask: torch.Tensor | None = None,
         ev: float = 0.0,
+        depth_model: DepthModel | None = None,
         **options: Any,
     ) -> io.NodeOutput:
         """Run Algorithm 1."""
@@ -270,7 +279,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         painter = _painter(observer, ball, mask, options)
         observer.expect(rounds_evaluations(painter, schedule))
         started = perf_counter()
-        result = iterative_inpaint(painter, request, schedule, observer)
+        result = iterative_inpaint(painter, request, schedule, observer, depth_of=depth_model)
         report = _report(request, schedule, result, perf_counter() - started)
         composite = paste_ball(request.canvas, result.ball, ball)
         return io.NodeOutput(result.ball, result.median, result.spread, composite, report)

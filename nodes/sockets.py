@@ -13,12 +13,15 @@ from comfy_api.latest import io
 
 from ..dl_core.errors import ImageError, OptionError
 
-__all__ = ["CATEGORY", "BallSocket", "as_rgb", "named_output", "parse_evs"]
+__all__ = ["CATEGORY", "BallSocket", "DepthModelSocket", "as_rgb", "named_output", "parse_evs"]
 
 CATEGORY: Final = "LightProbe"
 
 BallSocket = io.Custom("BALL")
 """A `dl_core.ball.Ball`: where the ball sits on the canvas."""
+
+DepthModelSocket = io.Custom("DEPTH_MODEL")
+"""What estimates depth, near bright, when called with an IMAGE: a `dl_core.depth.DepthModel`."""
 
 
 def named_output(kind: Any, name: str, tooltip: str, *, is_list: bool = False) -> Any:

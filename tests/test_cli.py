@@ -4,19 +4,22 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 import torch
-from analytic_painter import AnalyticPainter
+from analytic_painter import AnalyticPainter, Flaws
+from depth_models import save_depth_anything
 from PIL import Image as PILImage
 
 from dl_core import __version__, cli
 from dl_core.backends.loading import BACKENDS, Backend, LoadedPainter
+from dl_core.ball import paint_depth
 from dl_core.commands import estimate
+from dl_core.depth import load_depth_model
 from dl_core.errors import Interrupted, ModelError
 from dl_core.exposure import MERGES, encode_display
 from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_ball
@@ -159,6 +162,44 @@ def test_radiance_output_and_depth(backend: Callable[..., None], photo: Path, ou
     assert cli.main([*argv, "--depth", str(photo)]) == 0
     assert names(out) == ["a.ball.png", "a.hdr", "a.spheres.png"]
     assert read_envmap(out / "a.hdr").shape == (1, 256, 512, 3)
+
+
+def test_depth_from_a_models_folder_is_that_of_each_round(
+    backend: Callable[..., None], photo: Path, out: Path, tmp_path: Path
+) -> None:
+    painter = AnalyticPainter(sun_and_sky(), Flaws(noise=0.05))
+    backend(painter)
+    folder = save_depth_anything(tmp_path / "depth")
+    assert run(photo, out, "--depth", str(folder), "--preset", "balanced") == 0
+    first, last = painter.requests[:2]
+    depth = load_depth_model(folder)
+    for request in (first, last):
+        torch.testing.assert_close(request.depth, paint_depth(depth(request.canvas), request.ball), rtol=0, atol=1e-5)
+    assert not torch.equal(first.depth, last.depth)
+
+
+def test_a_folder_without_a_depth_model_is_named(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend()
+    assert run(photo, out, "--depth", str(photo.parent)) == 1
+    assert f"{photo.parent}: holds no config.json" in capsys.readouterr().err
+    assert names(out) == []
+
+
+def test_what_the_painter_notes_is_reported_by_exposure(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class ShortOfMemory(AnalyticPainter):
+        def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+            notes = ("out of memory with 4 balls at once: went on with 2",) if request.ev == 0 else ()
+            return replace(super().paint(request, observer), notes=notes)
+
+    backend(ShortOfMemory(sun_and_sky()))
+    assert run(photo, out) == 0
+    assert "EV 0: out of memory with 4 balls at once: went on with 2\n" in capsys.readouterr().out
+    assert run(photo, out, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == ["EV 0: out of memory with 4 balls at once: went on with 2"]
 
 
 def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:

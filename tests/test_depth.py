@@ -6,6 +6,8 @@ Values are held against transformers' own pipeline on the same folder.
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -65,8 +67,8 @@ def test_distance_is_inverted(folders: dict[str, Path], photo: torch.Tensor) -> 
     depth = model(photo)[0, ..., 0]
     reference = predicted_by_transformers(folders["metric"], photo)
     assert not model.nearer_is_larger
-    # Both are resized after the network, there in metres and here in their inverse.
-    assert torch.corrcoef(torch.stack([depth.flatten(), (1 / reference).flatten()]))[0, 1] > 0.999
+    # Both are resized after the network, there in metres and here in their inverse, which differs where it is steep.
+    assert torch.corrcoef(torch.stack([depth.flatten(), (1 / reference).flatten()]))[0, 1] > 0.99
     assert (float(depth.min()), float(depth.max())) == (0, 1)
 
 
@@ -198,3 +200,8 @@ def test_missing_weights_are_told_but_for_the_one_that_has_no_use(folders: dict[
     )
     with pytest.raises(ModelError, match=r"lacks \d+ of its weights, such as head\."):
         load_depth_model(folder)
+
+
+def test_importing_it_does_not_import_transformers() -> None:
+    code = "import sys, dl_core.depth; assert 'transformers' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent.parent)

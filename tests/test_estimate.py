@@ -9,7 +9,7 @@ import pytest
 import torch
 from analytic_painter import AnalyticPainter, Flaws
 
-from dl_core.ball import crop_ball, disc_mask
+from dl_core.ball import crop_ball, disc_mask, fit_canvas, paint_depth
 from dl_core.bench.skies import SunAndSky, sun_direction
 from dl_core.errors import ImageError, Interrupted, OptionError
 from dl_core.estimate import Settings, check_photograph, estimate, planned_evaluations
@@ -150,6 +150,21 @@ def test_a_wrong_option_is_named_before_anything_is_painted(options: dict[str, o
         estimate(PHOTO, painter, replace(SETTINGS, **options))  # type: ignore[arg-type]
     assert raised.value.name == name
     assert painter.requests == []
+
+
+def test_depth_is_estimated_of_the_canvas_and_again_of_each_composite() -> None:
+    painter, seen = AnalyticPainter(light()), list[torch.Tensor]()
+
+    def depth_of(canvas: torch.Tensor) -> torch.Tensor:
+        seen.append(canvas)
+        return canvas[..., :1]
+
+    estimate(PHOTO, painter, replace(SETTINGS, evs=(0.0, -2.5)), depth_of=depth_of)
+    # The photograph's own once; then, at each EV, that of the median the last ball is painted from.
+    assert [bool(torch.equal(canvas, fit_canvas(PHOTO, 128))) for canvas in seen] == [True, False, False]
+    depths = [request.depth for request in painter.requests]
+    assert torch.equal(depths[0], depths[2])
+    assert torch.equal(depths[0], paint_depth(seen[0][..., :1], painter.requests[0].ball))
 
 
 def test_bad_depth_is_named() -> None:

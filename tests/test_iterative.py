@@ -17,7 +17,7 @@ from dl_core.exposure import expose
 from dl_core.geometry import latlong_to_ball
 from dl_core.iterative import Rounds, iterative_inpaint, rounds_evaluations
 from dl_core.median import pixelwise_median
-from dl_core.painter import PaintRequest, SilentObserver, first_step
+from dl_core.painter import Observer, PaintRequest, PaintResult, SilentObserver, first_step
 from dl_core.presets import PRESETS, preset
 
 BALL = place_ball(96, 32, x=40, y=56)
@@ -110,6 +110,38 @@ def test_a_seed_fixes_the_result() -> None:
     )
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
+
+
+# --- depth of every round ----------------------------------------------------------------------------------------
+
+
+def test_every_median_gets_a_depth_of_its_own() -> None:
+    """The first round's is the request's; each later one is that of the composite, with the ball painted nearest."""
+    painter, asked, seen = AnalyticPainter(LIGHT, Flaws(noise=0.05)), request(), list[torch.Tensor]()
+
+    def depth_of(canvas: torch.Tensor) -> torch.Tensor:
+        seen.append(canvas)
+        return canvas.mean(dim=-1, keepdim=True)
+
+    iterative_inpaint(painter, asked, Rounds(balls=3, rounds=2, steps=5), depth_of=depth_of)
+    first, *later = painter.requests
+    assert torch.equal(first.depth, asked.depth)
+    assert len(later) == len(seen) == 2
+    for call, canvas in zip(later, seen, strict=True):
+        assert torch.equal(call.canvas, canvas)
+        assert torch.equal(call.depth, paint_depth(canvas.mean(dim=-1, keepdim=True), BALL))
+        assert call.depth[:, disc_mask(BALL)[0] == 1].min() == 1
+
+
+def test_what_the_painter_notes_is_in_the_result() -> None:
+    class Talkative(AnalyticPainter):
+        def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+            result = super().paint(request, observer)
+            return replace(result, notes=(f"painted {len(request.seeds)}",))
+
+    for rounds, notes in ((2, ("painted 3", "painted 3", "painted 1")), (0, ("painted 1",))):
+        result = iterative_inpaint(Talkative(LIGHT), request(), Rounds(balls=3, rounds=rounds, steps=5))
+        assert result.notes == notes
 
 
 # --- cost --------------------------------------------------------------------------------------------------------

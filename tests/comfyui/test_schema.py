@@ -12,6 +12,7 @@ from comfy_host import REPOSITORY, load_pack, pack_module
 
 SOCKETS = {
     "MiniProbeLoader": ("", "model clip vae control_net"),
+    "EstimateDepth": ("image", "depth depth_model"),
     "DepthBallMask": ("image depth", "canvas_image control_depth mask ball"),
     "EVPromptInterp": ("clip model", "model positive ev"),
     "ChromeBallInpaint": (
@@ -19,7 +20,7 @@ SOCKETS = {
         "balls composite evaluations",
     ),
     "IterativeMedian": (
-        "model positive negative vae control_net image depth ball mask ev",
+        "model positive negative vae control_net image depth ball mask ev depth_model",
         "ball median spread composite report",
     ),
     "CanvasToImage": ("canvas_image image ball", "image framed mask"),
@@ -110,7 +111,7 @@ def test_importing_the_pack_needs_no_comfyui() -> None:
 
 
 def test_starting_comfyui_does_not_import_diffusers() -> None:
-    """It takes seconds, and only the mini model needs it."""
+    """It takes seconds, and only the mini model needs it; its depth models are transformers' part of that."""
     code = (
         "import sys; sys.path[:0] = ['tests', '.']; import comfy_host; comfy_host.load_pack(); "
         "assert 'diffusers' not in sys.modules"
