@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -172,6 +173,43 @@ def test_interruption_at_any_step_leaves_the_painter_usable(
     with pytest.raises(Interrupted):
         painter.paint(request_, _Count(stop_at))
     assert torch.equal(painter.paint(request_, SilentObserver()).balls, before)
+
+
+def shortage(model: MiniModel, most: int) -> Any:
+    """Makes the UNet run out of memory with more than so many pictures at once; a handle to end it."""
+
+    def refuse(unet: torch.nn.Module, arguments: tuple[Tensor, ...]) -> None:
+        if len(arguments[0]) > most:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+    return model.unet.register_forward_pre_hook(refuse)
+
+
+def test_a_shortage_halves_the_batch_for_good_and_is_noted(model: MiniModel, request_: PaintRequest) -> None:
+    painter = DiffusersPainter.from_mini(model, batch=4)
+    asked = replace(request_, seeds=(1, 2, 3, 4))
+    counted, observer = _CountedUNet(model.unet), _Count()
+    handle = shortage(model, 4)  # two balls, with and without the prompt
+    try:
+        first, second = painter.paint(asked, observer), painter.paint(asked, SilentObserver())
+    finally:
+        handle.remove()
+        counted.handle.remove()
+    assert first.notes == ("out of memory with 4 balls at once: went on with 2",)
+    assert second.notes == ()
+    assert first.evaluations == observer.total == painter.evaluations(4, asked.steps, 1.0)
+    in_pairs = DiffusersPainter.from_mini(model, batch=2).paint(asked, SilentObserver()).balls
+    assert torch.equal(first.balls, in_pairs)
+    assert torch.equal(second.balls, in_pairs)
+
+
+def test_one_ball_that_does_not_fit_is_a_clear_error(model: MiniModel, request_: PaintRequest) -> None:
+    handle = shortage(model, 0)
+    try:
+        with pytest.raises(ModelError, match="does not fit in the memory of cpu with one ball"):
+            DiffusersPainter.from_mini(model, batch=2).paint(request_, SilentObserver())
+    finally:
+        handle.remove()
 
 
 def test_guidance_is_on_the_line_between_the_two_original_prompts(painter: DiffusersPainter) -> None:
