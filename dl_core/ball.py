@@ -145,7 +145,8 @@ def fit_canvas(image_ldr: Image, canvas: int) -> Float[Tensor, "b side side c"]:
     Raises:
         ImageError: an empty picture.
     """
-    frame = photograph_frame(*image_ldr.shape[1:3], canvas)
+    height, width = image_ldr.shape[1:3]
+    frame = photograph_frame(height, width, canvas)
     result = torch.zeros(image_ldr.shape[0], canvas, canvas, image_ldr.shape[3])
     frame.cut(result).copy_(_lanczos(image_ldr, frame.height, frame.width).clamp(0, 1))
     return result.to(image_ldr.device)

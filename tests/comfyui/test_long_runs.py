@@ -83,6 +83,7 @@ def interrupted(node: Nodes, graph: Any, scene: Any, at: int) -> int:
 def test_it_goes_on_where_it_was_interrupted(node: Nodes, graph: Any, scene: Any, at: int, finished: int) -> None:
     """A batch is 2 balls, that is 4 pictures an evaluation and 8 in all; an interrupt costs the batch it falls into."""
     whole = run(node, graph, scene)
+    assert whole[2].max() > 1e-3  # balls that differ, so that none can stand for another
     pack_module("nodes.inpaint").FINISHED.clear()
     # Nothing is evaluated after the interrupt.
     assert at <= interrupted(node, graph, scene, at) < at + 4
