@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ SAMPLING |= {"control_strength": 1.0, "batch_size": 2}
 PHOTO = torch.rand(1, 40, 60, 3, generator=torch.Generator().manual_seed(0))
 
 Nodes = Callable[[str], Any]
+
+
+@pytest.fixture(scope="module")
+def graph(trained_graph: Any, mini: Any) -> Any:
+    """Trained networks, since untrained ones paint nearly black balls, with a ControlNet that heeds the whole depth."""
+    return replace(trained_graph, control_net=pack_module("nodes.mini").to_controlnet(mini))
 
 
 @pytest.fixture

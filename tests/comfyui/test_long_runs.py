@@ -29,6 +29,12 @@ RUN_COST = (4 + 4 + 1) * BALL_COST
 Nodes = Callable[[str], Any]
 
 
+@pytest.fixture(scope="module")
+def graph(trained_graph: Any) -> Any:
+    """Trained networks: untrained ones paint nearly black balls, which are all alike."""
+    return trained_graph
+
+
 @pytest.fixture(autouse=True)
 def _no_gradients() -> Any:
     with torch.no_grad():
@@ -83,7 +89,7 @@ def interrupted(node: Nodes, graph: Any, scene: Any, at: int) -> int:
 def test_it_goes_on_where_it_was_interrupted(node: Nodes, graph: Any, scene: Any, at: int, finished: int) -> None:
     """A batch is 2 balls, that is 4 pictures an evaluation and 8 in all; an interrupt costs the batch it falls into."""
     whole = run(node, graph, scene)
-    assert whole[2].max() > 1e-3  # balls that differ, so that none can stand for another
+    assert whole[2].mean() > 0.01  # balls that differ, so that none can stand for another
     pack_module("nodes.inpaint").FINISHED.clear()
     # Nothing is evaluated after the interrupt.
     assert at <= interrupted(node, graph, scene, at) < at + 4
