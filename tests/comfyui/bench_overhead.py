@@ -73,7 +73,10 @@ def main() -> None:
     sampling = {"cfg": defaults.guidance, "sampler": "uni_pc", "scheduler": "leading (paper)"}
     sampling |= {"control_strength": defaults.control_scale, "batch_size": 4}
 
+    finished = pack_module("nodes.inpaint").FINISHED
+
     def run() -> None:
+        finished.clear()
         with torch.inference_mode():
             nodes["IterativeMedian"].execute(**sockets, **schedule, **sampling)
 
