@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-import comfy.utils
 import folder_paths
 import torch
 from comfy_api.latest import io
@@ -14,7 +13,7 @@ from comfy_api.latest import io
 from ..dl_core.errors import ModelError, OptionError
 from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
 from ..dl_core.prompts import DARK_PROMPT, PROMPT
-from .lora import with_lora
+from .lora import read_lora_file, with_lora
 from .sockets import CATEGORY, as_rgb, named_output, parse_evs
 
 __all__ = ["EVPromptInterp", "HDRMerge", "interpolate_conditioning"]
@@ -134,8 +133,7 @@ def _with_lora(model: Any, lora: str, scale: float) -> Any:
         return model
     if model is None:
         raise ModelError("socket model", "is not connected; it has to be for a LoRA to be loaded")
-    weights = comfy.utils.load_torch_file(folder_paths.get_full_path_or_raise("loras", lora), safe_load=True)
-    return with_lora(model, weights, scale, f"lora {lora}")
+    return with_lora(model, read_lora_file(lora), scale, f"lora {lora}")
 
 
 class HDRMerge(io.ComfyNode):  # type: ignore[misc]
