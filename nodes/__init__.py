@@ -10,11 +10,13 @@ from .equirect import BallToEquirect, EquirectToBall
 from .exposure import EVPromptInterp, HDRMerge
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
+from .turbo import TurboLoRASwap
 
 __all__ = ["NODES", "LightProbeExtension"]
 
 NODES: tuple[type[io.ComfyNode], ...] = (
     MiniProbeLoader,
+    TurboLoRASwap,
     DepthBallMask,
     EVPromptInterp,
     ChromeBallInpaint,

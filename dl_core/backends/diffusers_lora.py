@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -46,5 +47,8 @@ def add_lora(pipeline: Any, weights: Mapping[str, Tensor], adapter: str, source:
         named[f"unet.{layer}.lora_A.weight"] = product.down.to(unet.dtype)
         # diffusers takes a file of these names for one without α, so the up half carries it.
         named[f"unet.{layer}.lora_B.weight"] = (product.up.float() * product.scale).to(unet.dtype)
-    pipeline.load_lora_weights(named, adapter_name=adapter)
+    with warnings.catch_warnings():
+        # PEFT warns of a second adapter in one network, which is what is wanted.
+        warnings.filterwarnings("ignore", "Already found a `peft_config`", UserWarning)
+        pipeline.load_lora_weights(named, adapter_name=adapter)
     pipeline.set_adapters(adapter)

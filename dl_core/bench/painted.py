@@ -28,6 +28,14 @@ from .scoring import PROTOCOLS, score_maps, summarize_errors
 __all__ = ["add_arguments", "run"]
 
 
+_FILES: Final = {
+    "model": "checkpoint",
+    "controlnet": "depth ControlNet",
+    "lora": "exposure LoRA",
+    "turbo-lora": "Turbo LoRA",
+}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a painted run."""
     group = parser.add_argument_group("to paint the maps first")
@@ -37,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--variants", default="both", help=f"rows of the ablation: {','.join(VARIANTS)}, or all (default: both)")
     add("--preset", default="draft", help="schedule and bracket (default: draft)")
     add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
-    for name, what in (("model", "checkpoint"), ("controlnet", "depth ControlNet"), ("lora", "exposure LoRA")):
+    for name, what in _FILES.items():
         add(f"--{name}", metavar="PATH", help=f"{what} of the painter, as for estimate")
 
 
@@ -80,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _identity(painter: str, files: ModelFiles) -> str:
     """Name of a painter with a fingerprint of where its files lie: the folders themselves are nobody else's affair."""
-    places = (files.model, files.controlnet, files.lora)
+    places = (files.model, files.controlnet, files.lora, files.turbo_lora)
     if not any(places):
         return painter
     text = "\n".join("" if place is None else str(place.resolve()) for place in places)

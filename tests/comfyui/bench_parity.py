@@ -9,34 +9,22 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
 
 import torch  # noqa: E402
-from comfy_host import PHOTO, pack_module  # noqa: E402
+from comfy_host import PHOTO, leading_euler, pack_module  # noqa: E402
 
 PAIRS = (("euler", "euler"), ("unipc", "uni_pc"), ("unipc", "uni_pc_bh2"))
 SCHEDULES = ((6, 1.0), (10, 0.8), (30, 1.0))
 SEEDS = (0, 1)
 
 
-def on_paper_timesteps(config: Any) -> Any:
-    """diffusers' Euler on the timesteps of the paper's schedule."""
-    from diffusers import EulerDiscreteScheduler
-
-    class LeadingEuler(EulerDiscreteScheduler):
-        def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
-            super().set_timesteps(timesteps=pack_module("nodes.painter").leading_timesteps(num_inference_steps))
-
-    return LeadingEuler.from_config(config)
-
-
 def main() -> None:
     """Print one row a sampler and schedule."""
     painting, ports = pack_module("nodes.painter"), pack_module("dl_core.painter")
     backend, balls = pack_module("dl_core.backends.diffusers_painter"), pack_module("dl_core.ball")
-    backend.SAMPLERS["euler"] = on_paper_timesteps
+    backend.SAMPLERS["euler"] = leading_euler
     mini = replace(pack_module("dl_core.backends.mini").load_mini(), lora=None)
     convert, defaults = pack_module("nodes.mini"), mini.defaults
     clip = convert.to_clip(mini)

@@ -12,8 +12,9 @@ from comfy_host import REPOSITORY, load_pack, pack_module
 
 SOCKETS = {
     "MiniProbeLoader": ("", "model clip vae control_net"),
+    "TurboLoRASwap": ("model", "model"),
     "DepthBallMask": ("image depth", "canvas_image control_depth mask ball"),
-    "EVPromptInterp": ("clip model", "model positive ev"),
+    "EVPromptInterp": ("clip model original dark", "model positive ev"),
     "ChromeBallInpaint": (
         "model positive negative vae control_net image depth ball mask ev",
         "balls composite evaluations",
@@ -94,6 +95,8 @@ def test_defaults_are_the_papers(schemas: dict[str, Any]) -> None:
     assert pack_module("nodes.sockets").parse_evs(steering["evs"]) == paper
     assert steering["ev_min"] == -5.0
     assert steering["lora_scale"] == 0.75
+    turbo = {item.id: getattr(item, "default", None) for item in schemas["TurboLoRASwap"].inputs}
+    assert (turbo["turbo_scale"], turbo["exposure_scale"], turbo["timestep"]) == (1.0, 0.75, 800)
 
 
 def test_importing_the_pack_needs_no_comfyui() -> None:
