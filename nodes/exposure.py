@@ -158,8 +158,8 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
         """Encode both prompts once and interpolate between these originals for every EV."""
         values = check_evs(parse_evs(evs))
         shares = _shares(values, ev_min, weights)
-        ends = [_encoded(clip, prompt, original), _encoded(clip, dark_prompt, dark)]
-        positive = [interpolate_conditioning(*ends, share) for share in shares]
+        bright, black = _encoded(clip, prompt, original), _encoded(clip, dark_prompt, dark)
+        positive = [interpolate_conditioning(bright, black, share) for share in shares]
         return io.NodeOutput(_with_lora(model, lora, lora_scale), positive, list(values))
 
 
