@@ -44,11 +44,11 @@ def add_lora(pipeline: Any, weights: Mapping[str, Tensor], adapter: str, source:
     unet = pipeline.unet
     named: dict[str, Tensor] = {}
     for layer, product in read_lora(weights, lora_shapes(unet), source).items():
-        named[f"unet.{layer}.lora_A.weight"] = product.down.to(unet.dtype)
+        named[f"{layer}.lora_A.weight"] = product.down.to(unet.dtype)
         # diffusers takes a file of these names for one without α, so the up half carries it.
-        named[f"unet.{layer}.lora_B.weight"] = (product.up.float() * product.scale).to(unet.dtype)
+        named[f"{layer}.lora_B.weight"] = (product.up.float() * product.scale).to(unet.dtype)
     with warnings.catch_warnings():
         # PEFT warns of a second adapter in one network, which is what is wanted.
         warnings.filterwarnings("ignore", "Already found a `peft_config`", UserWarning)
-        pipeline.load_lora_weights(named, adapter_name=adapter)
+        unet.load_lora_adapter(named, prefix=None, adapter_name=adapter)
     pipeline.set_adapters(adapter)
