@@ -296,6 +296,7 @@ def test_swap_agrees_with_diffusers(
     )
     expected, found, other = (brush.paint(asked, Recorder()) for brush in (theirs, ours, unswapped))
     assert expected.balls.std() > 0.05
-    # Without LoRAs the painters differ by 5e-4, for what nodes/painter.py says of partly covered cells.
+    # The painters differ by about as much without LoRAs (bench_parity.py), for what nodes/painter.py says of cells
+    # the mask covers partly.
     assert (found.balls - expected.balls).abs().mean() < 1e-3 < 2e-3 < (other.balls - expected.balls).abs().mean()
     assert found.evaluations == expected.evaluations == ours.evaluations(1, 6, strength) == {1.0: 12, 0.8: 8}[strength]
