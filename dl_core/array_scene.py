@@ -2,10 +2,10 @@
 
 Lengths are in radii of the spheres. The layout was measured on renders of the authors' scene: a square lattice of 3 x 3
 spheres, 2.89 apart, with its diagonals along the sides of the picture; a camera 14.6 above the centres with a lens of
-50 mm on 36 mm; a square plane that fills the frame, beyond which light comes from below the horizon. Theirs is turned by
--1.3 degrees in the picture and its plane ends just inside the frame; this one is straight, so that a quarter turn leaves
-it as it is. What renders cannot tell was chosen: Lambert's law with an albedo of 0.8, and -Z at the top of the picture,
-+X at its right.
+50 mm on 36 mm; a square plane that fills the frame, beyond which light comes from below the horizon. Theirs is turned
+by -1.3 degrees in the picture and its plane ends just inside the frame; this one is straight, so that a quarter turn
+leaves it as it is. What renders cannot tell was chosen: Lambert's law with an albedo of 0.8, and -Z at the top of the
+picture, +X at its right.
 
 Nothing here is random, and the picture is linear in the map. From a point, spheres cover circles of the sky, and each
 row of the map is covered between azimuths that have a closed form; what is left of a row is the difference of its
@@ -95,6 +95,10 @@ class _Points:
         """Which lie right of the middle and ahead of it."""
         return (self.places[:, 0] > 0) & (self.places[:, 2] < 0)
 
+    @property
+    def on_spheres(self) -> bool:
+        return bool((self.owner >= 0).any())
+
     def turned(self) -> _Points:
         places = _turned(self.places)
         owner = torch.cdist(_turned(_centres()), _centres()).argmin(-1)[self.owner]
@@ -110,14 +114,12 @@ def _on_spheres(normals: Float[Tensor, "n 3"], owner: Int[Tensor, "n"]) -> _Poin
     return _Points(_centres()[owner] + normals, normals, owner)
 
 
-def _nearest(places: Float[Tensor, "*n 3"], directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 9"]:
-    """Distance at which a ray enters each sphere; infinite where it misses it or starts on it."""
-    to_centre = _centres() - places[..., None, :]
-    along = (to_centre * directions[..., None, :]).sum(-1)
-    beyond = to_centre.square().sum(-1) - 1  # 0 on the sphere itself
+def _entries(places: Float[Tensor, "n 3"], directions: Float[Tensor, "n rays 3"]) -> Float[Tensor, "n rays 9"]:
+    """How far rays from outside enter each sphere; infinite where they miss it."""
+    along = directions @ _centres().T - (directions @ places[..., None])
+    beyond = torch.cdist(places, _centres()).square()[:, None] - 1
     root = along.square() - beyond
-    hit = (root > 0) & (along > 0) & (beyond > 1e-4)
-    return torch.where(hit, along - root.clamp(min=0).sqrt(), math.inf)
+    return torch.where((root > 0) & (along > 0), along - root.clamp(min=0).sqrt(), math.inf)
 
 
 # --- open sky ----------------------------------------------------------------------------------------------------
@@ -139,13 +141,15 @@ class _Sky:
     low: Tensor
     high: Tensor
 
-    def irradiance(self, table: Float[Tensor, "cells 3 width"]) -> Float[Tensor, "n width"]:
+    def irradiance(self, table: Float[Tensor, "3 cells width"]) -> Float[Tensor, "n width"]:
         """Light from the open sky, given `_integrals`."""
-        flat = table.flatten(1)
-        device = flat.device
-        starts, low, high = self.starts.to(device), self.low.to(device), self.high.to(device)
-        seen = F.embedding_bag(high, flat, starts, mode="sum") - F.embedding_bag(low, flat, starts, mode="sum")
-        return (seen.unflatten(1, (3, -1)) * self.normals.to(seen)[..., None]).sum(1)
+        starts, low, high = (part.to(table.device) for part in (self.starts, self.low, self.high))
+        light = table.new_zeros(len(starts), table.shape[2])
+        for part, along in zip(table, self.normals.to(table).unbind(1), strict=True):
+            if bool(along.any()):
+                seen = F.embedding_bag(high, part, starts, mode="sum") - F.embedding_bag(low, part, starts, mode="sum")
+                light = light + along[:, None] * seen
+        return light
 
 
 def _sky_polar() -> Float[Tensor, "rows"]:
@@ -153,21 +157,25 @@ def _sky_polar() -> Float[Tensor, "rows"]:
 
 
 def _arcs(centre: Float[Tensor, "*n"], half_cosine: Float[Tensor, "*n"]) -> tuple[Int[Tensor, "*n"], Int[Tensor, "*n"]]:
-    """First and last column of arcs around an azimuth, given the cosine of half their width; none above 1."""
-    half = torch.acos(half_cosine.clamp(-1, 1))
+    """Columns where arcs around an azimuth begin, and where they end, which may be in the next turn.
+
+    Args:
+        centre: azimuths in radians.
+        half_cosine: cosine of half an arc's width; no arc above 1, the whole row below -1.
+    """
     unit = _COLUMNS / (2 * math.pi)
-    first = torch.round((centre + math.pi - half) * unit).long()
-    length = torch.round((centre + math.pi + half) * unit).long() - first
-    return torch.where(length > 0, torch.remainder(first, _COLUMNS), 0), torch.remainder(first, _COLUMNS) * (
-        length > 0
-    ) + length
+    middle, half = (centre + math.pi) * unit, torch.acos(half_cosine.clamp(-1, 1)) * unit
+    begin = torch.round(middle - half)
+    length = (torch.round(middle + half) - begin).int()
+    first = torch.where(length > 0, torch.remainder(begin, _COLUMNS).int(), 0)
+    return first, first + length
 
 
 def _gaps(first: Int[Tensor, "*n arcs"], last: Int[Tensor, "*n arcs"]) -> tuple[Tensor, Tensor]:
     """What arcs leave of a row: beginnings and ends, one more than arcs; nothing where an end is not greater."""
     shift = 2 * _COLUMNS + 1
     ordered = (first * shift + last).sort(dim=-1).values
-    over = (last - _COLUMNS).amax(-1, keepdim=True).clamp(min=0)
+    over = (last.amax(-1, keepdim=True) - _COLUMNS).clamp(min=0)
     reached = torch.cat((over, ordered % shift), dim=-1).cummax(-1).values.clamp(max=_COLUMNS)
     begun = torch.div(ordered, shift, rounding_mode="floor")
     return reached, torch.cat((begun, torch.full_like(over, _COLUMNS)), dim=-1)
@@ -203,7 +211,7 @@ def _plane_arcs(points: _Points, polar: Tensor) -> tuple[Tensor, Tensor]:
 
 def _covers(points: _Points, polar: Tensor) -> tuple[Tensor, Tensor]:
     covers = [_sphere_caps(points, polar)]
-    if bool((points.owner >= 0).any()):
+    if points.on_spheres:
         level = torch.zeros(len(points.places), 1)
         covers += [_caps(-points.normals[:, None], level, polar), _plane_arcs(points, polar)]
     return torch.cat([first for first, _ in covers], -1), torch.cat([last for _, last in covers], -1)
@@ -211,31 +219,44 @@ def _covers(points: _Points, polar: Tensor) -> tuple[Tensor, Tensor]:
 
 def _sky(points: _Points) -> _Sky:
     """Open sky of points of one kind; from the plane, only rows above the horizon are sky."""
-    polar = _sky_polar() if bool((points.owner >= 0).any()) else _sky_polar()[: _ROWS // 2]
+    polar = _sky_polar() if points.on_spheres else _sky_polar()[: _ROWS // 2]
     counts, low, high = [], [], []
     for some in torch.arange(len(points.places)).split(512):
         begin, end = _gaps(*_covers(points[some], polar))
-        row = (torch.arange(len(polar)) * (_COLUMNS + 1))[None, :, None]
+        row = (torch.arange(len(polar), dtype=torch.int32) * (_COLUMNS + 1))[None, :, None]
         open_sky = end > begin
         counts.append(open_sky.sum((1, 2)))
-        low.append((row + begin)[open_sky].int())
-        high.append((row + end)[open_sky].int())
+        low.append((row + begin)[open_sky])
+        high.append((row + end)[open_sky])
     count = torch.cat(counts)
     return _Sky(points.normals, (count.cumsum(0) - count).int(), torch.cat(low), torch.cat(high))
 
 
-def _integrals(latlong_hdr: Latlong) -> Float[Tensor, "cells 3 width"]:
-    """Running integrals of rows of the sky, times the parts of the direction, for four quarter turns of the map."""
-    polar = _sky_polar().to(latlong_hdr)[:, None]
-    azimuth = ((torch.arange(_COLUMNS) + 0.5) * (2 * math.pi / _COLUMNS) - math.pi).to(latlong_hdr)[None]
+def _sphere_directions(rows: int, columns: int) -> Float[Tensor, "rows columns 3"]:
+    """Middles of the pixels of a map of any shape."""
+    polar = ((torch.arange(rows) + 0.5) * (math.pi / rows))[:, None]
+    azimuth = ((torch.arange(columns) + 0.5) * (2 * math.pi / columns) - math.pi)[None]
     across = torch.sin(polar)
-    parts = (across * torch.sin(azimuth), torch.cos(polar).expand(-1, _COLUMNS), -across * torch.cos(azimuth))
-    directions = torch.stack(parts, dim=-1)
+    parts = (across * torch.sin(azimuth), torch.cos(polar).expand(-1, columns), -across * torch.cos(azimuth))
+    return torch.stack(parts, dim=-1)
+
+
+@lru_cache(maxsize=1)
+@torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
+def _sky_grid() -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, "3 rows columns"]]:
+    """Directions of the parts of the sky, and their parts times the solid angle."""
+    directions = _sphere_directions(_ROWS, _COLUMNS)
+    angle = 2 * math.sin(math.pi / _ROWS / 2) * torch.sin(_sky_polar()) * (2 * math.pi / _COLUMNS)
+    return directions, directions.permute(2, 0, 1) * angle[:, None]
+
+
+def _integrals(latlong_hdr: Latlong) -> Float[Tensor, "3 cells width"]:
+    """Running integrals of rows of the sky, times the parts of the direction, for four quarter turns of the map."""
+    directions, weights = (part.to(latlong_hdr) for part in _sky_grid())
     values = sample_latlong(latlong_hdr, directions).permute(1, 2, 0, 3).flatten(2)
     turns = torch.stack([torch.roll(values, -k * (_COLUMNS // 4), dims=1) for k in range(4)], dim=2).flatten(2)
-    band = 2 * math.sin(math.pi / _ROWS / 2) * across * (2 * math.pi / _COLUMNS)
-    table = (turns[:, :, None] * (directions * band[..., None])[..., None]).cumsum(1)
-    return F.pad(table, (0, 0, 0, 0, 1, 0)).flatten(0, 1)
+    # An empty column in front of the first: nothing is left of it.
+    return (F.pad(turns, (0, 0, 1, 0)) * F.pad(weights, (1, 0))[..., None]).cumsum(2).flatten(1, 2)
 
 
 # --- surfaces ----------------------------------------------------------------------------------------------------
@@ -247,11 +268,7 @@ def _patches() -> tuple[_Points, _Points]:
     cell = (torch.arange(_CELLS) + 0.5) * (2 * PLANE_HALF / _CELLS) - PLANE_HALF
     z, x = torch.meshgrid(cell, cell, indexing="ij")
     plane = _on_plane(torch.stack((x, torch.zeros_like(x), z), dim=-1).flatten(0, 1))
-    polar = ((torch.arange(_RINGS) + 0.5) * (math.pi / _RINGS))[:, None]
-    azimuth = ((torch.arange(2 * _RINGS) + 0.5) * (math.pi / _RINGS))[None]
-    across = torch.sin(polar)
-    parts = (across * torch.sin(azimuth), torch.cos(polar).expand(-1, 2 * _RINGS), -across * torch.cos(azimuth))
-    normals = torch.stack(parts, dim=-1).flatten(0, 1)
+    normals = _sphere_directions(_RINGS, 2 * _RINGS).flatten(0, 1)
     owner = torch.arange(9).repeat_interleave(len(normals))
     return plane, _on_spheres(normals.repeat(9, 1), owner)
 
@@ -262,7 +279,7 @@ def _patch_of(places: Float[Tensor, "*n 3"], owner: Int[Tensor, "*n"]) -> Int[Te
     column, row = (axis.floor().clamp(0, _CELLS - 1).long() for axis in (x, z))
     normals = places - _centres()[owner.clamp(min=0)]
     polar = torch.acos(normals[..., 1].clamp(-1, 1)) * (_RINGS / math.pi)
-    azimuth = torch.atan2(normals[..., 0], -normals[..., 2]) * (_RINGS / math.pi)
+    azimuth = torch.atan2(normals[..., 0], -normals[..., 2]) * (_RINGS / math.pi) + _RINGS
     ring = polar.floor().clamp(0, _RINGS - 1).long()
     on_sphere = (owner * _RINGS + ring) * (2 * _RINGS) + torch.remainder(azimuth.floor().long(), 2 * _RINGS)
     return torch.where(owner < 0, row * _CELLS + column, _CELLS**2 + on_sphere)
@@ -286,8 +303,9 @@ def _around(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n gathered 3"]:
 def _seen_patches(points: _Points) -> Int[Tensor, "n gathered"]:
     """The patch in each direction; -1 where the sky is."""
     directions = _around(points.normals)
-    places = points.places[:, None].expand_as(directions)
-    entry = torch.where((torch.arange(9) == points.owner[:, None])[:, None], math.inf, _nearest(places, directions))
+    places = points.places[:, None]
+    own = torch.arange(9) == points.owner[:, None]
+    entry = torch.where(own[:, None], math.inf, _entries(points.places, directions))
     distance, owner = entry.min(-1)
     down = torch.where(directions[..., 1] < -1e-6, -places[..., 1] / directions[..., 1], math.inf)
     down = torch.where((points.owner < 0)[:, None], math.inf, down)
@@ -319,12 +337,13 @@ class _Surfaces:
         return seen * self.share.to(radiosity)[:, None]
 
 
-def _surfaces(points: _Points, sky: _Sky) -> _Surfaces:
-    uniform = _integrals(torch.ones(1, _MAP_ROWS, 2 * _MAP_ROWS, 1))
-    closed = (1 - sky.irradiance(uniform)[:, 0] / math.pi).clamp(min=0)
+def _surfaces(points: _Points, sky: Float[Tensor, "n"]) -> _Surfaces:
+    """What points gather along, given the share of a uniform surrounding that the open sky gives them."""
     seen = torch.cat([_seen_patches(points[some]) for some in torch.arange(len(points.places)).split(512)])
     count = (seen >= 0).sum(-1)
-    return _Surfaces((count.cumsum(0) - count).int(), seen[seen >= 0].int(), closed / count.clamp(min=1))
+    return _Surfaces(
+        (count.cumsum(0) - count).int(), seen[seen >= 0].int(), (1 - sky).clamp(min=0) / count.clamp(min=1)
+    )
 
 
 @dataclass(frozen=True)
@@ -334,7 +353,7 @@ class _Lighting:
     skies: tuple[_Sky, _Sky]
     surfaces: tuple[_Surfaces, _Surfaces]
 
-    def direct(self, table: Float[Tensor, "cells 3 width"]) -> Float[Tensor, "n width"]:
+    def direct(self, table: Float[Tensor, "3 cells width"]) -> Float[Tensor, "n width"]:
         return torch.cat([sky.irradiance(table) for sky in self.skies])
 
     def gathered(self, radiosity: Float[Tensor, "patches width"]) -> Float[Tensor, "n width"]:
@@ -343,7 +362,9 @@ class _Lighting:
 
 def _lighting(plane: _Points, spheres: _Points) -> _Lighting:
     skies = (_sky(plane), _sky(spheres))
-    return _Lighting(skies, (_surfaces(plane, skies[0]), _surfaces(spheres, skies[1])))
+    uniform = _integrals(torch.full((1, _MAP_ROWS, 2 * _MAP_ROWS, 1), 1 / math.pi))
+    open_sky = [sky.irradiance(uniform)[:, 0] for sky in skies]
+    return _Lighting(skies, (_surfaces(plane, open_sky[0]), _surfaces(spheres, open_sky[1])))
 
 
 # --- the picture -------------------------------------------------------------------------------------------------
@@ -378,7 +399,8 @@ def _quarter() -> _Quarter:
     floor = grid.reshape(half**2, _SUBPIXELS**2, 3)
     eye = torch.tensor([0.0, CAMERA_HEIGHT, 0.0])
     rays = F.normalize(floor - eye, dim=-1)
-    distance, owner = _nearest(eye.expand_as(rays), rays).min(-1)
+    distance, owner = (found.squeeze(0) for found in _entries(eye[None], rays.flatten(0, 1)[None]).min(-1))
+    distance, owner = distance.view(rays.shape[:2]), owner.view(rays.shape[:2])
     hit = torch.isfinite(distance)
     normals = eye + distance.clamp(max=1e3)[..., None] * rays - _centres()[owner]
     coverage = hit.float().mean(-1)
