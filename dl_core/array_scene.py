@@ -45,13 +45,13 @@ PLANE_HALF: Final = CAMERA_HEIGHT * 18 / 50
 SIZE: Final = 256
 """Rows and columns of the picture."""
 ALBEDO: Final = 0.8
-BOUNCES: Final = 8
-"""Of light between surfaces: what is left after them is below 1e-4 of the picture."""
+BOUNCES: Final = 12
+"""Of light between surfaces: what is left after them is 1e-4 of the picture's RMS."""
 
 _MAP_ROWS: Final = 128
 _ROWS: Final = 2 * _MAP_ROWS
 """Rows of the sky in which shadows are found: two to a row of the map, or a small sun's shadow has steps."""
-_COLUMNS: Final = 1024
+_COLUMNS: Final = 512
 """Azimuths at which a shadow may begin."""
 _CELLS: Final = 64
 """Patches along a side of the plane."""

@@ -18,7 +18,7 @@ from ..imageio import read_envmap
 from .journal import Journal
 from .pairs import ERROR_COLUMNS, protocol
 from .report import Column, Report, Row, panorama_files, prepare_output, publish
-from .scoring import PROTOCOLS, score_maps, summarize_errors
+from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "pair_maps", "run"]
 
@@ -73,7 +73,8 @@ def run(args: argparse.Namespace) -> int:
             journal.add([{"panorama": predicted.stem, **row} for row in rows])
     summary = _summarize(journal.rows, PROTOCOLS[args.protocol].parts)
     report = Report("protocol", _description(args), journal.rows, summary, time.perf_counter() - started)
-    publish(report, args, rows=_ROWS, summary=_SUMMARY)
+    summary_head = (Column("sphere", "sphere"), Column("maps", "panoramas"))
+    publish(report, args, rows=_ROWS, summary=(*summary_head, *summary_columns(args.protocol, ERROR_COLUMNS)))
     return 0
 
 
@@ -99,8 +100,3 @@ def _summarize(rows: list[Row], parts: tuple[str, ...]) -> list[Row]:
 
 
 _ROWS: Final = (Column("panorama", "panorama"), Column("sphere", "sphere"), *ERROR_COLUMNS)
-_SUMMARY: Final = (
-    Column("sphere", "sphere"),
-    Column("maps", "panoramas"),
-    *(Column(f"mean {column.title}", column.key, column.form) for column in ERROR_COLUMNS),
-)
