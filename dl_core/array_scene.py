@@ -338,7 +338,10 @@ class _Surfaces:
 
 
 def _surfaces(points: _Points, sky: Float[Tensor, "n"]) -> _Surfaces:
-    """What points gather along, given the share of a uniform surrounding that the open sky gives them."""
+    """What points gather along, given the share of a uniform surrounding that the open sky gives them.
+
+    Points near the tops of spheres see up to 1.1% of plane, edge on, where none of the directions goes: it stays black.
+    """
     seen = torch.cat([_seen_patches(points[some]) for some in torch.arange(len(points.places)).split(512)])
     count = (seen >= 0).sum(-1)
     return _Surfaces(

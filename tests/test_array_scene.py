@@ -90,7 +90,7 @@ def test_a_mirrored_map_mirrors_the_picture(generator: torch.Generator) -> None:
     assert float((mirrored - picture.flip(2)).square().mean().sqrt()) < 2e-3
 
 
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(seed=st.integers(0, 99), scale=st.floats(1e-2, 1e3))
 def test_the_picture_is_linear_in_the_map(seed: int, scale: float) -> None:
     maps = torch.rand(2, 16, 32, 3, generator=torch.Generator().manual_seed(seed))
@@ -100,7 +100,7 @@ def test_the_picture_is_linear_in_the_map(seed: int, scale: float) -> None:
 
 def test_gradients_are_those_of_a_linear_function(generator: torch.Generator) -> None:
     latlong = torch.rand(1, 16, 32, 1, generator=generator, dtype=torch.float64, requires_grad=True)
-    picture = render_array(latlong)
+    picture = render_array(latlong, bounces=2)
     picture.sum().backward()
     assert_close((latlong.grad * latlong).sum().detach(), picture.sum().detach())
 
