@@ -1,6 +1,6 @@
 """ComfyPainter: the Painter port on ComfyUI's own sampling.
 
-With nodes/mini.py this is the only file that touches ComfyUI's internals: `comfy.sample.sample_custom`,
+With nodes/from_diffusers.py and nodes/mini.py this is the only file that touches ComfyUI's internals: `comfy.sample.sample_custom`,
 `comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules), a model's `model_function_wrapper`, `model_sampling`
 and `model_config`, a ControlNet's `copy` and `set_cond_hint`, and a VAE's `encode`, `decode`
 and `first_stage_model`.
