@@ -1,7 +1,7 @@
 """One set of weights in ComfyUI and in diffusers' own pipeline, stage by stage: `python tests/comfyui/bench_parity.py`.
 
-SDXL's true topology at a tenth of its width (`toy_sdxl`) and the mini model. Then balls by sampler: Euler shows that the
-paths agree; UniPC differs by design, ComfyUI's being of third order (bh1, bh2), diffusers' of second (bh2).
+SDXL's true topology at a tenth of its width (`toy_sdxl`) and the mini model. Then balls by sampler: Euler shows that
+the paths agree; UniPC differs by design, ComfyUI's being of third order (bh1, bh2), diffusers' of second (bh2).
 """
 
 from __future__ import annotations
