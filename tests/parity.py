@@ -258,9 +258,9 @@ def stages(pair: Pair, steps: int = 30) -> list[Stage]:
         steps: of the full trajectories.
     """
     plain = replace(pair, defaults=replace(pair.defaults, guidance=1.0))
-    found = [*_network_stages(plain, request_of(plain, 4)), *_autoencoder_stages(pair)]
-    found.append(_sdedit_stage(plain, request_of(plain, 10, 0.8)))
-    found += _guided_stages(pair, request_of(pair, 4))
+    found = [*_network_stages(plain, request_of(plain, 2)), *_autoencoder_stages(pair)]
+    found.append(_sdedit_stage(plain, request_of(plain, 2, 0.5)))
+    found += _guided_stages(pair, request_of(pair, 2))
     for strength in (1.0, 0.8):
         asked = request_of(pair, steps, strength)
         theirs = pipeline_balls(pair, asked, on_paper_timesteps(pair.pipeline.scheduler.config))
@@ -303,7 +303,7 @@ def _network_stages(pair: Pair, request: Any) -> Iterator[Stage]:
 def _sdedit_stage(pair: Pair, request: Any) -> Stage:
     ours, theirs = _recorded(pair, request)
     difference = _relative(ours.latents[0], theirs.latents[0])
-    return Stage("SDEdit start, strength 0.8", difference, 1e-4, "relative", ORDER)
+    return Stage("SDEdit start, strength 0.5", difference, 1e-4, "relative", ORDER)
 
 
 def _guided_stages(pair: Pair, request: Any) -> Iterator[Stage]:

@@ -16,8 +16,8 @@ def faults(pair: Pair, steps: int) -> list[str]:
 
 
 def test_sdxls_topology_agrees_with_diffusers_pipeline(pack: Any) -> None:
-    assert faults(toy_pair(), steps=6) == []
+    assert faults(toy_pair(), steps=4) == []
 
 
 def test_the_mini_model_agrees_with_diffusers_pipeline(trained: Any) -> None:
-    assert faults(mini_pair(trained), steps=6) == []
+    assert faults(mini_pair(trained), steps=4) == []
