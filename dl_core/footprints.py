@@ -27,6 +27,7 @@ from torch import Tensor
 
 from .projection import Lens, Projection
 from .shapes import BallImage, Directions, Latlong
+from .sparse_rows import SparseRows
 
 __all__ = ["Footprints", "coverage", "spherical", "unwrap"]
 
@@ -97,35 +98,6 @@ class Footprints:
         return torch.stack((x[None, :].expand(len(y), -1), y[:, None].expand(-1, len(x))), dim=-1)
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Rows of a sparse matrix.
-
-    Attributes:
-        starts: (n,) where each row begins.
-        columns: (entries,) column of each entry.
-        values: (entries,).
-    """
-
-    starts: Int[Tensor, "n"]
-    columns: Int[Tensor, "e"]
-    values: Float[Tensor, "e"]
-
-    def __matmul__(self, dense: Float[Tensor, "k c"]) -> Float[Tensor, "n c"]:
-        """Product with a dense matrix; its gradient costs what the product costs, unlike that of torch.sparse."""
-        return F.embedding_bag(
-            self.columns, dense, self.starts, mode="sum", per_sample_weights=self.values.to(dense.dtype)
-        )
-
-    def spread(self, per_row: Float[Tensor, "n"]) -> Float[Tensor, "e"]:
-        """A value of each row, at each of its entries."""
-        ends = torch.cat((self.starts[1:], self.starts.new_tensor([len(self.columns)])))
-        return per_row.repeat_interleave(ends - self.starts)
-
-    def to(self, device: torch.device) -> _Rows:
-        return _Rows(self.starts.to(device), self.columns.to(device), self.values.to(device))
-
-
 def unwrap(ball: BallImage, key: Footprints) -> Latlong:
     """Average a ball over the footprints of a map's pixels; differentiable in the ball."""
     strips, used = (_cached_matrix if 2 * key.height**2 <= CACHED_PIXELS else _matrix)(key, ball.device)
@@ -150,7 +122,7 @@ def _join(parts: Float[Tensor, "m b p q c"], key: Footprints) -> Latlong:
 
 @torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
 @torch.no_grad()
-def _matrix(key: Footprints, device: torch.device) -> tuple[tuple[_Rows, ...], Tensor]:
+def _matrix(key: Footprints, device: torch.device) -> tuple[tuple[SparseRows, ...], Tensor]:
     """The matrix of `key.part` of a map in strips of rows, and which ball pixels (size, size) it reads."""
     height, width = key.part
     rows = max(1, STRIP_PIXELS // (width * key.samples**2))
@@ -163,7 +135,7 @@ def _matrix(key: Footprints, device: torch.device) -> tuple[tuple[_Rows, ...], T
     return tuple(strips), (weights > 0).view(key.size, key.size).to(device)
 
 
-def _balanced(key: Footprints, strip: _Rows, weights: Float[Tensor, "k"]) -> _Rows:
+def _balanced(key: Footprints, strip: SparseRows, weights: Float[Tensor, "k"]) -> SparseRows:
     """Rows scaled by the weights of what they read, and then to a sum of 1; the input is overwritten."""
     blind = torch.nonzero(strip.spread((strip @ weights[:, None])[:, 0]) <= 0).squeeze(1)
     # A point of the outline between pixels that are all left out: read 2.5 pixels further in.
@@ -186,7 +158,7 @@ def _pulled_in(key: Footprints, pixels: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
 _cached_matrix = lru_cache(maxsize=8)(_matrix)
 
 
-def _pixel_weights(key: Footprints, strips: list[_Rows]) -> Float[Tensor, "k"]:
+def _pixel_weights(key: Footprints, strips: list[SparseRows]) -> Float[Tensor, "k"]:
     """Weights of the ball's pixels, 0 for those left out.
 
     Beside the rim a bilinear sample reaches past the ball, and rows leave those pixels out and share their weight
@@ -209,7 +181,7 @@ def _sweep(
     key: Footprints,
     weights: Float[Tensor, "k"],
     covered: Float[Tensor, "k"],
-    strips: list[_Rows],
+    strips: list[SparseRows],
     solid: Float[Tensor, "h"],
 ) -> Float[Tensor, "k"]:
     """One sweep of Sinkhorn's iteration: rows to 1, then columns to what the ball covers of each pixel."""
@@ -243,7 +215,7 @@ def coverage(
     return inside
 
 
-def _strip(key: Footprints, first: int, rows: int) -> _Rows:
+def _strip(key: Footprints, first: int, rows: int) -> SparseRows:
     """Unbalanced matrix of some rows of the map: bilinear weights of every cell."""
     across, down = _cell_counts(key, first, rows)
     starts = (4 * across * down).cumsum(0)
@@ -258,7 +230,7 @@ def _strip(key: Footprints, first: int, rows: int) -> _Rows:
         )
         places = starts[pixels, None] + torch.arange(kind_columns.shape[1])
         columns[places], values[places] = kind_columns, kind_values
-    return _Rows(starts.int(), columns, values)
+    return SparseRows(starts.int(), columns, values)
 
 
 def _cell_counts(key: Footprints, first: int, rows: int) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:

@@ -153,7 +153,7 @@ def _require_comparable(estimate: Tensor, truth: Tensor, mask: Tensor) -> None:
         sizes = " and ".join(f"{picture.shape[1]} x {picture.shape[0]}" for picture in (estimate, truth))
         raise ImageError("estimate", f"and truth are {sizes} pixels; two pictures of one size are compared")
     for name, picture in (("estimate", estimate), ("truth", truth)):
-        if not bool(torch.isfinite(picture).all()):
+        if not all(math.isfinite(end) for end in torch.aminmax(picture)):
             raise ImageError(name, "holds NaN or infinite values")
     if not bool(mask.any()):
         raise ImageError("mask", "holds nowhere; nothing is left to compare")
@@ -175,7 +175,19 @@ def _normalize(values: Float[Tensor, "n 3"], frame: Float[Tensor, "*n 3"]) -> Fl
 
     A frame of one value, up to float32's rounding, has no range: it becomes 0 everywhere.
     """
-    low, high = np.percentile(frame.double().cpu().numpy(), RANGE)
+    low, high = _percentiles(frame.cpu().numpy().ravel(), RANGE)
     if high - low <= 1e-6 * max(abs(low), abs(high)):
         return torch.zeros_like(values)
     return (values - low) / (high - low)
+
+
+def _percentiles(values: np.ndarray, ranks: tuple[float, float]) -> list[float]:
+    """Percentiles, linear between order statistics, which are all that is put in order: a whole frame has millions."""
+    places = [(len(values) - 1) * rank / 100 for rank in ranks]
+    around = [(math.floor(place), math.ceil(place)) for place in places]
+    ordered = np.partition(values, sorted({whole for pair in around for whole in pair}))
+    below, above = ordered[[pair[0] for pair in around]], ordered[[pair[1] for pair in around]]
+    return [
+        float(low) + (float(high) - float(low)) * (place % 1)
+        for low, high, place in zip(below, above, places, strict=True)
+    ]

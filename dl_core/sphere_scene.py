@@ -20,6 +20,7 @@ Ramamoorthi and Hanrahan, A signal-processing framework for inverse rendering (S
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -30,9 +31,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .errors import OptionError
-from .geometry import latlong_neighbours, require_latlong, sample_latlong
+from .geometry import latlong_neighbours, require_latlong
 from .microfacet import Surface
 from .shapes import Image, Latlong
+from .sparse_rows import SparseRows
 
 __all__ = ["AUTHORS_SPHERES", "AUTHORS_VIEW", "View", "render_sphere", "view_coverage"]
 
@@ -184,48 +186,26 @@ def view_coverage(view: View, *, samples: int = 8) -> Float[Tensor, "h w"]:
 
 def _mirror(latlong_hdr: Latlong, surface: Surface, view: View) -> Float[Tensor, "b rows columns c"]:
     """Mean of what each pixel reflects: 0.3 map pixels of a 128-row map between samples at the centre."""
-    batch, height = latlong_hdr.shape[:2]
-    seen = _reflections(surface, view, height)
-    dense = latlong_hdr.permute(1, 2, 0, 3).flatten(0, 1).flatten(1)
-    starts, columns, shares = (part.to(latlong_hdr.device) for part in (seen.starts, seen.columns, seen.shares))
-    rows = F.embedding_bag(columns, dense, starts, mode="sum", per_sample_weights=shares.to(dense.dtype))
-    return _place(view, seen.pixels, rows.unflatten(1, (batch, -1)).transpose(0, 1))
+    pixels, seen = _reflections(surface, view, latlong_hdr.shape[1])
+    return _place(view, pixels, _read(latlong_hdr, [seen]))
 
 
-@dataclass(frozen=True)
-class _Reflections:
-    """What pixels that show a mirror see of a map's: rows of a sparse matrix.
-
-    Attributes:
-        pixels: which pixels of the picture, (n,).
-        starts: where the entries of each begin, (n,).
-        columns: pixels of the map, (entries,).
-        shares: of their radiance, (entries,).
-    """
-
-    pixels: Tensor
-    starts: Tensor
-    columns: Tensor
-    shares: Tensor
+def _read(latlong: Latlong, strips: Sequence[SparseRows]) -> Float[Tensor, "b n c"]:
+    """What rows of sparse matrices read of the pixels of maps."""
+    dense = latlong.permute(1, 2, 0, 3).flatten(0, 1).flatten(1)
+    rows = torch.cat([strip.to(latlong.device) @ dense for strip in strips])
+    return rows.unflatten(1, (latlong.shape[0], -1)).transpose(0, 1)
 
 
 @lru_cache(maxsize=4)
 @torch.inference_mode(mode=False)  # a cached inference tensor could never take part in a gradient
-def _reflections(surface: Surface, view: View, height: int) -> _Reflections:
+def _reflections(surface: Surface, view: View, height: int) -> tuple[Tensor, SparseRows]:
+    """Pixels that show a mirror, and what each sees of a map."""
     points = _samples(view, min(16, max(4, math.ceil(560 / view.radius))))
     columns, shares = latlong_neighbours(_mirror_directions(view, points), height)
     covered = points.inside / points.inside.sum(-1, keepdim=True)
     shares = shares * (covered * surface.fresnel(torch.cos(points.incidence)))[..., None]
-    pixel = torch.arange(len(points.pixels)).view(-1, 1, 1).expand_as(columns)
-    seen = shares > 0
-    size = (len(points.pixels), 2 * height**2)
-    matrix = torch.sparse_coo_tensor(
-        torch.stack((pixel[seen], columns[seen])), shares[seen], size, check_invariants=True
-    )
-    matrix = matrix.coalesce()
-    pixel, columns = matrix.indices()
-    starts = torch.searchsorted(pixel, torch.arange(size[0]))
-    return _Reflections(points.pixels, starts, columns, matrix.values())
+    return points.pixels, SparseRows.gathered(columns.flatten(1), shares.flatten(1), 2 * height**2)
 
 
 def _mirror_directions(view: View, points: _Samples) -> Float[Tensor, "n s 3"]:
@@ -285,26 +265,33 @@ def _kernel(surface: Surface, distance: float) -> Float[Tensor, "frequencies rin
     return torch.cat(rings).permute(2, 0, 1).contiguous()
 
 
-@lru_cache(maxsize=8)
-def _axis_directions(elevation: float, parts: int) -> tuple[Float[Tensor, "h p w p 3"], Float[Tensor, "h p 1 1 1"]]:
-    """Directions of parts of the pixels of a map around the camera's axis, and the parts' shares of their pixel."""
-    steps = (torch.arange(parts) + 0.5) / parts
-    polar = ((torch.arange(_ROWS)[:, None] + steps) * (math.pi / _ROWS))[:, :, None, None]
-    azimuth = ((torch.arange(2 * _ROWS)[:, None] + steps) * (math.pi / _ROWS))[None, None]
-    angle, azimuth = torch.broadcast_tensors(polar, azimuth)
-    share = torch.sin(polar)[..., None]
-    return _directions(View(1, 1, 1.0, elevation=elevation).axes, angle, azimuth), share / share.sum(1, keepdim=True)
-
-
-def _around_axis(latlong_hdr: Latlong, elevation: float) -> Float[Tensor, "b rows columns c"]:
-    """The map with the camera's axis for its pole, its pixels averaged.
+@lru_cache(maxsize=4)
+@torch.inference_mode(mode=False)
+def _axis_rows(elevation: float, height: int) -> tuple[SparseRows, ...]:
+    """What pixels of a map around the camera's axis read of one around the vertical, in strips of rows.
 
     Four samples along a pixel of the map keep the energy of a light one pixel wide within 0.1%; two only within 0.6%.
     """
-    parts = min(12, max(2, math.ceil(4 * latlong_hdr.shape[1] / _ROWS)))
-    directions, share = _axis_directions(elevation, parts)
-    values = sample_latlong(latlong_hdr, directions.to(latlong_hdr))
-    return (values * share.to(latlong_hdr)[None]).sum(2).mean(3)
+    parts = min(12, max(2, math.ceil(4 * height / _ROWS)))
+    steps = (torch.arange(parts) + 0.5) / parts
+    azimuth = ((torch.arange(2 * _ROWS)[:, None] + steps) * (math.pi / _ROWS))[None, :, None, :]
+    axes = View(1, 1, 1.0, elevation=elevation).axes
+    strips = []
+    for rows in torch.arange(_ROWS).split(8):
+        polar = ((rows[:, None] + steps) * (math.pi / _ROWS))[:, None, :, None]
+        directions = _directions(axes, *torch.broadcast_tensors(polar, azimuth))
+        columns, shares = latlong_neighbours(directions, height)
+        weight = torch.sin(polar) / (torch.sin(polar).sum(dim=2, keepdim=True) * parts)
+        shares = shares * weight[..., None]
+        strips.append(
+            SparseRows.gathered(columns.flatten(0, 1).flatten(1), shares.flatten(0, 1).flatten(1), 2 * height**2)
+        )
+    return tuple(strips)
+
+
+def _around_axis(latlong_hdr: Latlong, elevation: float) -> Float[Tensor, "b rows columns c"]:
+    """The map with the camera's axis for its pole, its pixels averaged."""
+    return _read(latlong_hdr, _axis_rows(elevation, latlong_hdr.shape[1])).unflatten(1, (_ROWS, 2 * _ROWS))
 
 
 def _rings(around: Latlong, kernel: Tensor) -> Float[Tensor, "b rings azimuths c"]:

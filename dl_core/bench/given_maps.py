@@ -17,7 +17,7 @@ from ..errors import ImageError, OptionError
 from ..imageio import read_envmap
 from .journal import Journal
 from .pairs import ERROR_COLUMNS, protocol
-from .report import Column, Report, Row, panorama_files, prepare_output, publish
+from .report import Column, Report, Row, median_and_worst, panorama_files, prepare_output, publish
 from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "pair_maps", "run"]
@@ -69,12 +69,14 @@ def run(args: argparse.Namespace) -> int:
     done = journal.done
     for predicted, truth in pairs:
         if predicted.stem not in done:
-            rows = score_maps(read_envmap(predicted), read_envmap(truth), args.protocol, args.convention)
-            journal.add([{"panorama": predicted.stem, **row} for row in rows])
+            maps = read_envmap(predicted), read_envmap(truth)
+            begun = time.perf_counter()
+            rows = score_maps(*maps, args.protocol, args.convention)
+            spent = {"score_seconds": time.perf_counter() - begun}
+            journal.add([{"panorama": predicted.stem, **row, **spent} for row in rows])
     summary = _summarize(journal.rows, PROTOCOLS[args.protocol].parts)
     report = Report("protocol", _description(args), journal.rows, summary, time.perf_counter() - started)
-    summary_head = (Column("sphere", "sphere"), Column("maps", "panoramas"))
-    publish(report, args, rows=_ROWS, summary=(*summary_head, *summary_columns(args.protocol, ERROR_COLUMNS)))
+    publish(report, args, rows=_ROWS, summary=(*_HEAD, *summary_columns(args.protocol, ERROR_COLUMNS), _TIME))
     return 0
 
 
@@ -95,8 +97,11 @@ def _summarize(rows: list[Row], parts: tuple[str, ...]) -> list[Row]:
     summary = []
     for sphere in parts:
         of_sphere = [row for row in rows if row["sphere"] == sphere]
-        summary.append({"sphere": sphere, "panoramas": len(of_sphere), **summarize_errors(of_sphere)})
+        spent = median_and_worst(of_sphere, "score_seconds")
+        summary.append({"sphere": sphere, "panoramas": len(of_sphere), **summarize_errors(of_sphere), **spent})
     return summary
 
 
 _ROWS: Final = (Column("panorama", "panorama"), Column("sphere", "sphere"), *ERROR_COLUMNS)
+_HEAD: Final = (Column("sphere", "sphere"), Column("maps", "panoramas"))
+_TIME: Final = Column("s an image, all spheres", "score_seconds", ".3f")
