@@ -4,7 +4,7 @@ Half a pixel of radius moves a light near the rim by degrees. The edge itself is
 what lies right behind it, so that there is nothing to see there. But the ring inside it is a compressed picture of the
 photograph around the ball, which is known. So the ring is predicted for a radius and a centre, and these are fitted by
 robust least squares. Free beside them are what a painter may get wrong without the ball being elsewhere: reflectance
-of each channel, focal length, sharpness.
+of each channel, focal length, blur.
 
 The error bar is a sandwich estimate over sectors of azimuth: neighbouring pixels err together, sectors hardly do.
 
@@ -16,12 +16,12 @@ sandwich over clusters; Roberts, The unreasonable effectiveness of quasirandom s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .ball import Ball
@@ -35,12 +35,12 @@ __all__ = ["BallFit", "fit_ball", "nominal_fit"]
 REACH: Final = 2.0
 """Pixels by which radius and each coordinate may differ from the nominal ones."""
 SECTORS: Final = 24
-SAMPLES: Final = 32
+SAMPLES: Final = 48
 """Points of a pixel; they lie on a lattice, so that in any direction all are apart."""
 EDGE: Final = 0.25
 """Width in pixels over which a sample passes from the ball to the background: makes coverage differentiable."""
 STEPS: Final = (0.02, 0.02, 0.02, 0.005, 0.05, 0.02, 0.02, 0.02)
-"""Of the numeric derivatives: radius, x, y (pixels), log focal length, sharpness (pixels), log reflectances."""
+"""Of the numeric derivatives: radius, x, y (pixels), log focal length, variance of blur (px²), log reflectances."""
 PRIOR: Final = (math.inf, math.inf, math.inf, 0.02, 0.5, 0.3, 0.3, 0.3)
 """Standard deviations that are expected of the same."""
 CLIPPED: Final = 0.995
@@ -140,15 +140,16 @@ class _Scene:
         self.points = torch.stack((x[ring], y[ring]), dim=-1)
         self.observed = painted[0][ring]
         self.background, self.background_known = radiance[0][ring], known[0, ..., 0][ring]
+        self.inner = distance[ring] < radius - 3
         angle = torch.atan2(self.points[:, 1] - ball.centre[1], self.points[:, 0] - ball.centre[0])
         self.sector = ((angle / (2 * math.pi) + 0.5) * SECTORS).long().clamp(0, SECTORS - 1)
 
     def predict(self, parameters: Tensor, samples: int, every: int = 1) -> tuple[Tensor, Tensor]:
         """Display values (n, 3) of every so many pixels of the ring, and how far each is known, 0 to 1 (n,)."""
-        radius, x, y, log_focal, sharpness = parameters[:5].tolist()
+        radius, x, y, log_focal, blur = parameters[:5].tolist()
         centre, points = (x, y), self.points[::every]
         lens = self.projection.lens(radius, centre, self.size)
-        offsets = _lattice(samples) * (1 + abs(sharpness))
+        offsets = _lattice(samples, math.sqrt(max(0.0, blur)))
         disc = (points[:, None] + offsets - torch.tensor(centre)) / radius * torch.tensor([1.0, -1.0])
         gap = (_outline(lens, disc.mean(dim=1))[:, None] - torch.linalg.norm(disc, dim=-1)) * radius
         on_ball = (gap / EDGE + 0.5).clamp(0, 1)
@@ -190,12 +191,14 @@ def _known(source: Image, ball: Ball, *, hidden: bool) -> Float[Tensor, "1 s s 1
     return known
 
 
-def _lattice(samples: int) -> Float[Tensor, "s 2"]:
-    """Points of a pixel about its middle, -0.5 to 0.5: a rank-one lattice of the plastic number."""
+def _lattice(samples: int, blur: float) -> Float[Tensor, "s 2"]:
+    """Points of a pixel about its middle, spread by a Gaussian of `blur` pixels: a rank-one lattice."""
     index = torch.arange(samples, dtype=torch.float64)[:, None]
-    steps = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
+    root = 1.1673039782614187  # of x^5 = x + 1: the most even steps in four dimensions
+    steps = torch.tensor([root**-1, root**-2, root**-3, root**-4], dtype=torch.float64)
     points = (index * steps + 0.5) % 1
-    return (points - points.mean(dim=0)).float()  # their mean off the middle would move the ball
+    spread = torch.special.ndtri(points[:, 2:].clamp(1e-3, 1 - 1e-3)) * blur + points[:, :2]
+    return (spread - spread.mean(dim=0)).float()  # their mean off the middle would move the ball
 
 
 def _outline(lens: Lens, disc: Disc) -> Float[Tensor, "n"]:
@@ -239,7 +242,7 @@ def _solution(scene: _Scene) -> _Solution:
 def _grid(scene: _Scene) -> list[Tensor]:
     offsets = torch.tensor([-1.2, -0.6, 0.0, 0.6, 1.2], dtype=torch.float64)
     return [
-        torch.cat((scene.nominal + offset, torch.zeros(5, dtype=torch.float64)))
+        torch.cat((scene.nominal + offset, torch.tensor([0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)))
         for offset in torch.cartesian_prod(offsets, offsets, offsets)
     ]
 
@@ -251,7 +254,9 @@ def _coarse(scene: _Scene, start: Tensor) -> float:
     there = known > 0.5
     if int(there.sum()) < 60:
         return math.inf
-    gain = torch.stack([(o / p.clamp(min=1e-3)).median() for o, p in zip(observed[there].T, predicted[there].T)])
+    gain = torch.stack(
+        [(o / p.clamp(min=1e-3)).median() for o, p in zip(observed[there].T, predicted[there].T, strict=True)]
+    )
     rest = (observed - predicted * gain)[there].abs()
     return float((rest / (rest + 0.03)).mean())
 
@@ -340,11 +345,23 @@ def _explained(scene: _Scene, solution: _Solution) -> float:
 
 
 def _standard_errors(scene: _Scene, solution: _Solution) -> tuple[float, float, float]:
-    """Sandwich over sectors of azimuth, with the correction for their number."""
+    """Sandwich over sectors of azimuth, corrected for their number, and what inner and outer ring disagree by.
+
+    A wrong model of the ball errs in the same way in all sectors, but not at all distances from the rim.
+    """
     _, curvature = _normal(solution)
     scores = (solution.jacobian * (solution.weights * solution.residuals)[..., None]).sum(dim=1).double()
     by_sector = torch.zeros(SECTORS, scores.shape[1], dtype=torch.float64).index_add_(0, scene.sector, scores)
     inverse = torch.linalg.inv(curvature)
     covariance = inverse @ (by_sector.T @ by_sector) @ inverse * (SECTORS / (SECTORS - len(STEPS)))
-    radius, x, y = (covariance.diagonal()[:3].clamp(min=0) + FLOOR**2).sqrt().tolist()
+    apart = (_step_of(solution, scene.inner) - _step_of(solution, ~scene.inner))[:3] / 2
+    variance = covariance.diagonal()[:3].clamp(min=0) + apart.square() + FLOOR**2
+    radius, x, y = variance.sqrt().tolist()
     return radius, x, y
+
+
+def _step_of(solution: _Solution, part: Bool[Tensor, "n"]) -> Tensor:
+    """By how much the parameters would change if only a part of the ring were there."""
+    kept = solution.weights * part[:, None]
+    rise, curvature = _normal(replace(solution, weights=kept))
+    return torch.linalg.solve(curvature, rise)
