@@ -223,11 +223,14 @@ class _Solution:
     jacobian: Float[Tensor, "n 3 p"]
 
 
-def _robust(residuals: Tensor, known: Tensor) -> tuple[Tensor, float]:
-    """Cauchy's weights (n, 3) of residuals, and their scale: 1.5 median deviations, at least one 8-bit step."""
+def _robust(residuals: Tensor, known: Tensor) -> Tensor:
+    """Weights (n, 3) of residuals for a loss that is linear for large ones, so that it has few minima.
+
+    Their scale is 1.5 median deviations, at least one 8-bit step.
+    """
     there = residuals[known > 0.5]
     scale = 1 / 255 if len(there) == 0 else max(1 / 255, 1.5 * float(there.abs().median()))
-    return known[:, None] / (1 + (residuals / (2 * scale)).square()), scale
+    return known[:, None] / torch.sqrt(1 + (residuals / (2 * scale)).square())
 
 
 def _solution(scene: _Scene) -> _Solution:
@@ -236,7 +239,7 @@ def _solution(scene: _Scene) -> _Solution:
     starts = sorted((_coarse(scene, start), index) for index, start in enumerate(grid))
     refined = [_refine(scene, grid[index], 3) for _, index in starts[:2]]
     best = min(refined, key=_loss)
-    return _refine(scene, best.parameters, 8)
+    return _refine(scene, best.parameters, 16)
 
 
 def _grid(scene: _Scene) -> list[Tensor]:
@@ -268,7 +271,7 @@ def _loss(solution: _Solution) -> float:
 
 def _refine(scene: _Scene, start: Tensor, rounds: int) -> _Solution:
     """Levenberg-Marquardt with weights of the round before."""
-    parameters, damping = start, 1e-3
+    parameters, damping = start, 1e-6
     solution = _linearized(scene, parameters)
     for _ in range(rounds):
         rise, curvature = _normal(solution)
@@ -280,9 +283,9 @@ def _refine(scene: _Scene, start: Tensor, rounds: int) -> _Solution:
         if float((solution.weights * residuals.square()).sum()) > before * (1 + 1e-3):
             damping *= 10
             continue
-        damping = max(1e-6, damping / 5)
+        damping = max(1e-9, damping / 10)
         solution = _linearized(scene, trial)
-        if float(step[:3].abs().max()) < 2e-3:
+        if float(step[:3].abs().max()) < 1e-3:
             break
     return solution
 
@@ -296,7 +299,7 @@ def _linearized(scene: _Scene, parameters: Tensor) -> _Solution:
         shift = torch.zeros_like(parameters)
         shift[index] = step
         columns.append((scene.predict(parameters + shift, SAMPLES)[0] - predicted) / step)
-    return _Solution(parameters, residuals, _robust(residuals, known)[0], torch.stack(columns, dim=-1))
+    return _Solution(parameters, residuals, _robust(residuals, known), torch.stack(columns, dim=-1))
 
 
 def _normal(solution: _Solution) -> tuple[Tensor, Tensor]:
