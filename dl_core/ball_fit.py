@@ -39,8 +39,10 @@ SAMPLES: Final = 48
 """Points of a pixel; they lie on a lattice, so that in any direction all are apart."""
 EDGE: Final = 0.25
 """Width in pixels over which a sample passes from the ball to the background: makes coverage differentiable."""
-STEPS: Final = (0.02, 0.02, 0.02, 0.005, 0.05, 0.02, 0.02, 0.02)
-"""Of the numeric derivatives: radius, x, y (pixels), log focal length, variance of blur (px²), log reflectances."""
+STEPS: Final = (0.15, 0.15, 0.15, 0.02, 0.1, 0.05, 0.05, 0.05)
+"""Of the numeric derivatives: radius, x, y (pixels), log focal length, variance of blur (px²), log reflectances.
+
+Shorter ones measure the grain of the samples, which makes the problem look stiffer than it is."""
 PRIOR: Final = (math.inf, math.inf, math.inf, 0.02, 0.5, 0.3, 0.3, 0.3)
 """Standard deviations that are expected of the same."""
 CLIPPED: Final = 0.995
@@ -298,7 +300,8 @@ def _linearized(scene: _Scene, parameters: Tensor) -> _Solution:
     for index, step in enumerate(STEPS):
         shift = torch.zeros_like(parameters)
         shift[index] = step
-        columns.append((scene.predict(parameters + shift, SAMPLES)[0] - predicted) / step)
+        ahead, behind = (scene.predict(parameters + sign * shift, SAMPLES)[0] for sign in (1, -1))
+        columns.append((ahead - behind) / (2 * step))
     return _Solution(parameters, residuals, _robust(residuals, known), torch.stack(columns, dim=-1))
 
 
