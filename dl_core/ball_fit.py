@@ -48,6 +48,8 @@ PRIOR: Final = (math.inf, math.inf, math.inf, 0.02, 0.5, 0.3, 0.3, 0.3)
 CLIPPED: Final = 0.995
 FLOOR: Final = 0.01
 """Standard deviation, pixels, of what is not in the residuals: sampling, the encoding in which a painter mixes."""
+GRAIN: Final = 8 / 255
+"""Error of one value of the ring: an 8-bit step or two, and sixteen values erring together."""
 LARGEST_ERROR: Final = 0.06
 """Standard deviation, pixels, up to which a fit is worth more than the nominal circle."""
 LEAST_EXPLAINED: Final = 0.8
@@ -86,7 +88,7 @@ def fit_ball(
     *,
     fov: float = 60.0,
     projection: Projection = ORTHOGRAPHIC,
-    photograph_ldr: Image | None = None,
+    photograph_ldr: Float[Tensor, "k y x c"] | None = None,
 ) -> BallFit:
     """Fit radius and centre of a painted ball.
 
@@ -341,13 +343,13 @@ def _judged(scene: _Scene, ball: Ball, solution: _Solution) -> BallFit:
 
 
 def _explained(scene: _Scene, solution: _Solution) -> float:
-    """Share of the ring's variance, over channels and known pixels alike, that is not residual."""
+    """Share of the ring's variance, over channels and known pixels alike, that is not residual or rounding."""
     there = solution.weights.amax(dim=-1) > 0
     if int(there.sum()) < 100:
         return 0.0
     spread = (scene.observed - scene.observed[there].mean(dim=0))[there]
     rest = solution.residuals[there]
-    return max(0.0, 1 - float(rest.square().mean() / spread.square().mean().clamp(min=1e-9)))
+    return max(0.0, 1 - float((rest.square().mean() + 1 / 255**2) / spread.square().mean().clamp(min=1e-9)))
 
 
 def _standard_errors(scene: _Scene, solution: _Solution) -> tuple[float, float, float]:
@@ -361,7 +363,9 @@ def _standard_errors(scene: _Scene, solution: _Solution) -> tuple[float, float, 
     inverse = torch.linalg.inv(curvature)
     covariance = inverse @ (by_sector.T @ by_sector) @ inverse * (SECTORS / (SECTORS - len(STEPS)))
     apart = (_step_of(solution, scene.inner) - _step_of(solution, ~scene.inner))[:3] / 2
-    variance = covariance.diagonal()[:3].clamp(min=0) + apart.square() + FLOOR**2
+    # A ring without texture leaves no residual, and everything open: it counts as read to GRAIN.
+    read = inverse.diagonal()[:3].clamp(min=0) * GRAIN**2
+    variance = covariance.diagonal()[:3].clamp(min=0) + apart.square() + read + FLOOR**2
     radius, x, y = variance.sqrt().tolist()
     return radius, x, y
 

@@ -19,6 +19,7 @@ from typing import Final
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Tensor
 
 from ..ball import Ball, place_ball
@@ -28,7 +29,7 @@ from ..footprints import coverage
 from ..geometry import latlong_to_ball, latlong_to_perspective
 from ..imageio import read_envmap
 from ..projection import ORTHOGRAPHIC, disc_coordinates, disc_directions
-from ..shapes import Image, Latlong
+from ..shapes import Latlong
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 
 __all__ = ["FAULTS", "Circle", "add_arguments", "bench_fit", "composite", "direction_error", "run", "summarize"]
@@ -128,7 +129,9 @@ def bench_fit(panoramas: list[Path], faults: list[str], seed: int = 0, *, with_p
     return rows
 
 
-def composite(latlong_hdr: Latlong, photo_hdr: Image, circle: Circle) -> tuple[Image, Image]:
+def composite(
+    latlong_hdr: Latlong, photo_hdr: Float[Tensor, "b y x c"], circle: Circle
+) -> tuple[Float[Tensor, "b y x c"], Float[Tensor, "b y x 1"]]:
     """A photograph with a true orthographic ball in it, display-encoded, and the ball's share of each pixel."""
     side = 2 * math.ceil(circle.radius) + 2 * MARGIN
     left, top = round(circle.x) - side // 2, round(circle.y) - side // 2
@@ -143,7 +146,7 @@ def composite(latlong_hdr: Latlong, photo_hdr: Image, circle: Circle) -> tuple[I
     return expose(light, 0.0), covered
 
 
-def _with_fault(picture: Image, covered: Image, ball: Ball, fault: Fault, generator: torch.Generator) -> Image:
+def _with_fault(picture: Tensor, covered: Tensor, ball: Ball, fault: Fault, generator: torch.Generator) -> Tensor:
     """The picture as painted: with the fault inside the inpaint disc's square, in 8 bits."""
     first, side = ball.left - ball.dilation, ball.diameter + 2 * ball.dilation
     here = (slice(None), slice(ball.top - ball.dilation, ball.top - ball.dilation + side), slice(first, first + side))
