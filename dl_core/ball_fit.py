@@ -119,6 +119,19 @@ def fit_ball(
     return _judged(scene, ball, _solution(scene))
 
 
+@dataclass(frozen=True)
+class _Mixed:
+    """Light of pixels: what a perfect mirror reflects, what is behind it, and how far both are known."""
+
+    reflected: Float[Tensor, "n 3"]
+    behind: Float[Tensor, "n 3"]
+    known: Float[Tensor, "n"]
+
+    def display(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Display values with the reflectances of the parameters, and `known`."""
+        return encode_display(self.reflected * parameters[5:].float().exp() + self.behind), self.known
+
+
 class _Scene:
     """Ring of pixels to explain, and the photograph that explains it."""
 
@@ -150,6 +163,10 @@ class _Scene:
 
     def predict(self, parameters: Tensor, samples: int, every: int = 1) -> tuple[Tensor, Tensor]:
         """Display values (n, 3) of every so many pixels of the ring, and how far each is known, 0 to 1 (n,)."""
+        return self.mixed(parameters, samples, every).display(parameters)
+
+    def mixed(self, parameters: Tensor, samples: int, every: int = 1) -> _Mixed:
+        """Both parts of the light of the pixels, before the reflectances; the costly half of a prediction."""
         radius, x, y, log_focal, blur = parameters[:5].tolist()
         centre, points = (x, y), self.points[::every]
         lens = self.projection.lens(radius, centre, self.size)
@@ -160,13 +177,12 @@ class _Scene:
         values = self._look_up(lens.reflect(disc), self.focal * math.exp(log_focal)) * on_ball[..., None]
         coverage, total = on_ball.mean(dim=1), values.mean(dim=1)
         seen = total[:, 3] / coverage.clamp(min=1e-6)
-        reflected = total[:, :3] / seen.clamp(min=1e-3)[:, None] * parameters[5:].float().exp()
+        reflected = total[:, :3] / seen.clamp(min=1e-3)[:, None]
         outside = 1 - coverage
-        light = reflected + outside[:, None] * self.background[::every]
         known = torch.where(coverage > 1e-3, ((seen - 0.9) / 0.1).clamp(0, 1), torch.ones_like(seen))
         known = known * (1 - outside * (1 - self.background_known[::every]) / 0.02).clamp(0, 1)
         # The background alone says nothing.
-        return encode_display(light), known * (coverage > 1e-3)
+        return _Mixed(reflected, outside[:, None] * self.background[::every], known * (coverage > 1e-3))
 
     def _look_up(self, directions: Directions, focal: float) -> Float[Tensor, "n s 4"]:
         """Radiance times known, and known, of the photograph in some directions; zero off the frame."""
@@ -208,6 +224,8 @@ def _lattice(samples: int, blur: float) -> Float[Tensor, "s 2"]:
 def _outline(lens: Lens, disc: Disc) -> Float[Tensor, "n"]:
     """Distance of the outline from the ball's centre, in radii, in the direction of points of the disc."""
     toward = F.normalize(disc, dim=-1)
+    if lens.equal_area:  # only a ball seen by parallel rays is, and its outline is the unit circle
+        return torch.ones_like(toward[:, 0])
     low, high = torch.full_like(toward[:, 0], 0.8), torch.full_like(toward[:, 0], 2.0)
     for _ in range(22):
         middle = (low + high) / 2
@@ -227,6 +245,12 @@ class _Solution:
     jacobian: Float[Tensor, "n 3 p"]
 
 
+SETTLED: Final = 3e-3
+"""Pixels: a step of radius and centre below a third of FLOOR ends the search."""
+THINNED: Final = 4
+"""One of so many pixels of the ring serves until the last rounds, which have all of them."""
+
+
 def _robust(residuals: Tensor, known: Tensor) -> Tensor:
     """Weights (n, 3) of residuals for a loss that is linear for large ones, so that it has few minima.
 
@@ -241,9 +265,9 @@ def _solution(scene: _Scene) -> _Solution:
     """The best of a coarse grid, refined."""
     grid = _grid(scene)
     starts = sorted((_coarse(scene, start), index) for index, start in enumerate(grid))
-    refined = [_refine(scene, grid[index], 3) for _, index in starts[:2]]
-    best = min(refined, key=_loss)
-    return _refine(scene, best.parameters, 16)
+    refined = [_refine(scene, grid[index], 3, THINNED) for _, index in starts[:2]]
+    best = _refine(scene, min(refined, key=_loss).parameters, 16, THINNED)
+    return _refine(scene, best.parameters, 4)
 
 
 def _grid(scene: _Scene) -> list[Tensor]:
@@ -273,36 +297,42 @@ def _loss(solution: _Solution) -> float:
     return float((rest / (rest + 0.02)).mean()) if len(rest) else math.inf
 
 
-def _refine(scene: _Scene, start: Tensor, rounds: int) -> _Solution:
-    """Levenberg-Marquardt with weights of the round before."""
+def _refine(scene: _Scene, start: Tensor, rounds: int, every: int = 1) -> _Solution:
+    """Levenberg-Marquardt with weights of the round before, on every so many pixels."""
     parameters, damping = start, 1e-6
-    solution = _linearized(scene, parameters)
+    solution = _linearized(scene, parameters, every)
     for _ in range(rounds):
         rise, curvature = _normal(solution)
         step = torch.linalg.solve(curvature + damping * torch.diag(curvature.diagonal()), rise)
         step = step * min(1.0, 0.7 / max(1e-9, float(step[:3].abs().max())))
         trial = solution.parameters + step
-        residuals = scene.observed - scene.predict(trial, SAMPLES)[0]
+        residuals = scene.observed[::every] - scene.predict(trial, SAMPLES, every)[0]
         before = float((solution.weights * solution.residuals.square()).sum())
         if float((solution.weights * residuals.square()).sum()) > before * (1 + 1e-3):
             damping *= 10
             continue
         damping = max(1e-9, damping / 10)
-        solution = _linearized(scene, trial)
-        if float(step[:3].abs().max()) < 1e-3:
+        solution = _linearized(scene, trial, every)
+        if float(step[:3].abs().max()) < SETTLED:
             break
     return solution
 
 
-def _linearized(scene: _Scene, parameters: Tensor) -> _Solution:
+def _linearized(scene: _Scene, parameters: Tensor, every: int) -> _Solution:
     """Residuals, weights and derivatives at a point."""
-    predicted, known = scene.predict(parameters, SAMPLES)
-    residuals = scene.observed - predicted
+    here = scene.mixed(parameters, SAMPLES, every)
+    predicted, known = here.display(parameters)
+    residuals = scene.observed[::every] - predicted
     columns = []
     for index, step in enumerate(STEPS):
         shift = torch.zeros_like(parameters)
         shift[index] = step
-        ahead, behind = (scene.predict(parameters + sign * shift, SAMPLES)[0] for sign in (1, -1))
+        around = (parameters + shift, parameters - shift)
+        ahead, behind = (
+            # Reflectances come last and change nothing but how both parts are mixed.
+            (here if index >= 5 else scene.mixed(point, SAMPLES, every)).display(point)[0]
+            for point in around
+        )
         columns.append((ahead - behind) / (2 * step))
     return _Solution(parameters, residuals, _robust(residuals, known), torch.stack(columns, dim=-1))
 

@@ -30,6 +30,7 @@ from ..geometry import latlong_to_ball, latlong_to_perspective
 from ..imageio import read_envmap
 from ..projection import ORTHOGRAPHIC, disc_coordinates, disc_directions
 from ..shapes import Latlong
+from .journal import Journal
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 
 __all__ = ["FAULTS", "Circle", "add_arguments", "bench_fit", "composite", "direction_error", "run", "summarize"]
@@ -103,16 +104,46 @@ def run(args: argparse.Namespace) -> None:
     started = time.perf_counter()
     files = panorama_files(args.panoramas)
     prepare_output(args)
-    rows = bench_fit(files, args.faults, args.seed, with_photograph=not args.without_photograph)
+    journal = Journal(args.out, _identity(args, files), len(args.faults))
+    given = not args.without_photograph
+    rows = bench_fit(files, args.faults, args.seed, with_photograph=given, journal=journal)
     report = Report("fit", PROTOCOL, rows, summarize(rows), time.perf_counter() - started, seeds=(args.seed,))
     publish(report, args, rows=_ROWS, summary=_SUMMARY)
 
 
-def bench_fit(panoramas: list[Path], faults: list[str], seed: int = 0, *, with_photograph: bool = True) -> list[Row]:
-    """Fit a true ball of every panorama with every fault; one row each."""
+def _identity(args: argparse.Namespace, files: list[Path]) -> Row:
+    """What has to be the same for a stopped run to go on; names of the maps, whose folder may be elsewhere by then."""
+    return {
+        "bench": "fit",
+        "panoramas": [path.stem for path in files],
+        "faults": list(args.faults),
+        "seed": args.seed,
+        "photograph": not args.without_photograph,
+    }
+
+
+def bench_fit(
+    panoramas: list[Path],
+    faults: list[str],
+    seed: int = 0,
+    *,
+    with_photograph: bool = True,
+    journal: Journal | None = None,
+) -> list[Row]:
+    """Fit a true ball of every panorama with every fault; one row each.
+
+    Args:
+        panoramas: maps.
+        faults: names in `FAULTS`.
+        seed: of offsets and noise.
+        with_photograph: whether the fit is given the canvas before painting.
+        journal: holds the panoramas that are measured already, and keeps the others.
+    """
+    journal = journal or Journal(None, {}, len(faults))
     nominal = place_ball(CANVAS, DIAMETER)
-    rows = []
     for path in panoramas:
+        if path.stem in journal.done:
+            continue
         latlong = read_envmap(path)
         photo = latlong_to_perspective(latlong, CANVAS, CANVAS, fov=FOV, samples=1)
         scale = auto_exposure(photo)
@@ -120,13 +151,15 @@ def bench_fit(panoramas: list[Path], faults: list[str], seed: int = 0, *, with_p
         dr, dx, dy = (draw.uniform(-1, 1) for _ in range(3))
         true = Circle(DIAMETER / 2 + dr, nominal.centre[0] + dx, nominal.centre[1] + dy)
         picture, covered = composite(latlong * scale, photo * scale, true)
+        rows: list[Row] = []
         for fault in faults:
             generator = torch.Generator().manual_seed(seed)
             painted = _with_fault(picture, covered, nominal, FAULTS[fault], generator)
             given = quantize(expose(photo * scale, 0.0)) if with_photograph else None
             fit = fit_ball(painted, nominal, fov=FOV, photograph_ldr=given)
             rows.append({"panorama": path.stem, "fault": fault, **_row(fit, nominal, true)})
-    return rows
+        journal.add(rows)
+    return journal.rows
 
 
 def composite(
