@@ -50,8 +50,8 @@ FLOOR: Final = 0.01
 """Standard deviation, pixels, of what is not in the residuals: sampling, the encoding in which a painter mixes."""
 GRAIN: Final = 8 / 255
 """Error of one value of the ring: an 8-bit step or two, and sixteen values erring together."""
-LARGEST_ERROR: Final = 0.06
-"""Standard deviation, pixels, up to which a fit is worth more than the nominal circle."""
+LARGEST_ERROR: Final = 0.03
+"""Standard deviation, pixels, up to which a fit is used: three are half a degree, 20 degrees from straight ahead."""
 LEAST_EXPLAINED: Final = 0.8
 LEAST_SECTORS: Final = 12
 

@@ -32,7 +32,7 @@ def test_finds_a_true_ball_of_another_radius_and_centre():
     errors = (fit.radius - true.radius, fit.centre[0] - true.x, fit.centre[1] - true.y)
     # A pixel of radius moves a light 20 degrees from straight ahead by 5 degrees: half a degree is 0.1 px.
     assert max(abs(error) for error in errors) < 0.1
-    assert all(0 < sigma < 0.06 for sigma in fit.sigma)
+    assert all(0 < sigma < 0.03 for sigma in fit.sigma)
 
 
 def test_says_that_a_flat_scene_shows_nothing():
