@@ -28,8 +28,8 @@ class FitBall(io.ComfyNode):  # type: ignore[misc]
             display_name="Fit Ball",
             category=CATEGORY,
             description="Measures radius and centre of a painted ball by what its rim mirrors of the photograph. Half "
-            "a pixel of radius moves a light near the rim by degrees. Where the rim does not tell, the circle asked for "
-            "is kept, and the report says why.",
+            "a pixel of radius moves a light near the rim by degrees. Where the rim does not tell, the circle asked "
+            "for is kept, and the report says why.",
             is_input_list=True,
             inputs=[
                 io.Image.Input(
