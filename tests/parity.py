@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import torch
 from comfy_host import pack_module
-from PIL import Image as PILImage
+from reference_pipeline import pipeline_canvases
 from torch import Tensor
 from toy_sdxl import build_pipeline, comfy_networks
 
@@ -188,40 +188,13 @@ def comfy_balls(pair: Pair, request: Any, sampler: str = "euler") -> Tensor:
     return painter.paint(request, pack_module("dl_core.painter").SilentObserver()).balls
 
 
-def _picture(values: Tensor) -> PILImage.Image:
-    return PILImage.fromarray((values * 255).round().byte().numpy())
-
-
 def pipeline_balls(pair: Pair, request: Any, scheduler: Any) -> Tensor:
     """What diffusers' own pipeline paints, with embeddings on the line between the two prompts."""
     backend = pack_module("dl_core.backends.diffusers_painter")
-    pipeline, count = pair.pipeline, len(request.seeds)
-    guidance = backend.DiffusersPainter(pipeline, pair.defaults).guidance_at(request.ev)
-    mask = backend.ball_latent_mask(request.ball)[0, 0].repeat_interleave(8, 0).repeat_interleave(8, 1)
-    kept, pipeline.scheduler = pipeline.scheduler, scheduler
-    pipeline.set_progress_bar_config(disable=True)
-    try:
-        canvas = pipeline(
-            # A picture for each ball: of a single one only the first ball's generator draws a posterior.
-            image=[_picture(request.canvas[0])] * count,
-            mask_image=[_picture(mask)] * count,
-            control_image=[_picture(request.depth[0])] * count,
-            prompt_embeds=guidance.tokens.expand(count, -1, -1),
-            pooled_prompt_embeds=guidance.pooled.expand(count, -1),
-            negative_prompt_embeds=guidance.negative_tokens.expand(count, -1, -1),
-            negative_pooled_prompt_embeds=guidance.negative_pooled.expand(count, -1),
-            guidance_scale=pair.defaults.guidance,
-            controlnet_conditioning_scale=pair.defaults.control_scale,
-            num_inference_steps=request.steps,
-            strength=request.strength,
-            height=request.ball.canvas,
-            width=request.ball.canvas,
-            generator=[torch.Generator().manual_seed(seed) for seed in request.seeds],
-            output_type="pt",
-        ).images
-    finally:
-        pipeline.scheduler = kept
-    return pack_module("dl_core.ball").crop_ball(canvas.permute(0, 2, 3, 1).float(), request.ball)
+    guidance = backend.DiffusersPainter(pair.pipeline, pair.defaults).guidance_at(request.ev)
+    mask = backend.ball_latent_mask(request.ball)
+    canvases = pipeline_canvases(pair.pipeline, scheduler, request, guidance, pair.defaults, mask)
+    return pack_module("dl_core.ball").crop_ball(canvases, request.ball)
 
 
 def request_of(pair: Pair, steps: int, strength: float = 1.0) -> Any:
