@@ -8,6 +8,7 @@ from .depth_ball import DepthBallMask
 from .envmap_files import LoadEnvMap, SaveEnvMap
 from .equirect import BallToEquirect, EquirectToBall
 from .exposure import EVPromptInterp, HDRMerge
+from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
 from .turbo import TurboLoRASwap
@@ -22,6 +23,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     ChromeBallInpaint,
     IterativeMedian,
     HDRMerge,
+    FitBall,
     BallToEquirect,
     EquirectToBall,
     SaveEnvMap,

@@ -13,12 +13,15 @@ from comfy_api.latest import io
 
 from ..dl_core.errors import ImageError, OptionError
 
-__all__ = ["CATEGORY", "BallSocket", "as_rgb", "named_output", "parse_evs", "parse_numbers"]
+__all__ = ["CATEGORY", "BallFitSocket", "BallSocket", "as_rgb", "named_output", "parse_evs", "parse_numbers"]
 
 CATEGORY: Final = "LightProbe"
 
 BallSocket = io.Custom("BALL")
 """A `dl_core.ball.Ball`: where the ball sits on the canvas."""
+
+BallFitSocket = io.Custom("BALL_FIT")
+"""A `dl_core.ball_fit.BallFit`: radius and centre of a painted ball, as real numbers."""
 
 
 def named_output(kind: Any, name: str, tooltip: str, *, is_list: bool = False) -> Any:

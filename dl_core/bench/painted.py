@@ -23,7 +23,7 @@ from .painters import PAINTERS, open_studio
 from .paintings import VARIANTS, Painting, paint_maps, planned
 from .published import PUBLISHED
 from .report import Column, Report, Row, panorama_files, prepare_output, publish, table
-from .scoring import PROTOCOLS, score_maps, summarize_errors
+from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "run"]
 
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         seeds=(args.seed,),
         evaluations=sum({row["variant"] + row["shot"]: row["evaluations"] for row in rows}.values()),
     )
-    publish(report, args, rows=_ROWS, summary=_SUMMARY)
+    publish(report, args, rows=_ROWS, summary=(*_HEAD, *summary_columns(args.protocol, _FIGURE_COLUMNS)))
     if not args.json:
         sys.stdout.write(
             "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
@@ -160,5 +160,5 @@ _FIGURE_COLUMNS: Final = (
     Column("normalized RMSE", "normalized_rmse", ".3f"),
 )
 _ROWS: Final = (Column("shot", "shot"), Column("variant", "variant"), Column("sphere", "sphere"), *_FIGURE_COLUMNS)
-_SUMMARY: Final = (Column("method", "method"), Column("sphere", "sphere"), Column("maps", "maps"), *_FIGURE_COLUMNS)
+_HEAD: Final = (Column("method", "method"), Column("sphere", "sphere"), Column("maps", "maps"))
 _PUBLISHED: Final = (Column("data", "data"), Column("method", "method"), Column("sphere", "sphere"), *_FIGURE_COLUMNS)

@@ -444,6 +444,31 @@ def test_oblong_ball_is_refused(node: Nodes) -> None:
         node("BallToEquirect").execute(torch.rand(1, 4, 8, 3), height=8, yaw=0.0, samples=1)
 
 
+def test_a_fitted_circle_is_what_is_unwrapped(node: Nodes) -> None:
+    library = pack_module("dl_core.ball_fit")
+    place = pack_module("dl_core.ball").place_ball(256, 64)
+    fit = library.BallFit(31.4, (128.6, 127.7), (0.01, 0.01, 0.01), clear=True, reason="", explained=1.0)
+    crop = torch.rand(1, 64, 64, 3)
+    options = {"height": 32, "yaw": 0.0, "samples": 1}
+    found, coverage = node("BallToEquirect").execute(crop, ball=place, fit=fit, **options).args
+    geometry = pack_module("dl_core.geometry")
+    circle = {"radius": 31.4, "centre": (32.6, 31.7)}
+    torch.testing.assert_close(found, geometry.ball_to_latlong(crop, 32, painted=True, **circle))
+    torch.testing.assert_close(coverage, geometry.latlong_coverage(32, 64, **circle))
+    with pytest.raises(errors().OptionError, match="ball"):
+        node("BallToEquirect").execute(crop, fit=fit, **options)
+
+
+def test_fit_ball_keeps_the_circle_asked_for_where_nothing_tells(node: Nodes) -> None:
+    place = pack_module("dl_core.ball").place_ball(256, 64)
+    grey = torch.full((1, 64, 64, 3), 0.5)
+    fit, report = node("FitBall").execute([grey, grey], [torch.full((1, 256, 256, 3), 0.5)], [place]).args
+    assert (fit.radius, fit.centre, fit.clear) == (32.0, place.centre, False)
+    assert fit.reason in report
+    with pytest.raises(errors().ImageError, match="balls"):
+        node("FitBall").execute([grey[:, :32]], [torch.full((1, 256, 256, 3), 0.5)], [place])
+
+
 def smooth_latlong(height: int = 64) -> torch.Tensor:
     return torch.exp(pack_module("dl_core.geometry").latlong_directions(height))[None]
 
