@@ -39,6 +39,9 @@ PAPER_EVS: Final = (0.0, -2.5, -5.0)
 PRESETS: Final[dict[str, Preset]] = {
     "draft": Preset(Rounds(balls=3, rounds=1, strength=0.8, steps=6, final=False), PAPER_EVS, "a first look"),
     "balanced": Preset(Rounds(balls=5, rounds=1, strength=0.8, steps=20), PAPER_EVS, "a usable estimate"),
+    "turbo": Preset(
+        Rounds(balls=1, rounds=0, steps=30, final=False), PAPER_EVS, "one pass an exposure, for the Turbo LoRA"
+    ),
     "paper": Preset(Rounds(balls=30, rounds=2, strength=0.8, steps=30), PAPER_EVS, "the paper's schedule, 4,932 steps"),
 }
 

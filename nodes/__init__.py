@@ -9,20 +9,24 @@ from .depth_model import EstimateDepth
 from .envmap_files import LoadEnvMap, SaveEnvMap
 from .equirect import BallToEquirect, EquirectToBall
 from .exposure import EVPromptInterp, HDRMerge
+from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
+from .turbo import TurboLoRASwap
 
 __all__ = ["NODES", "LightProbeExtension"]
 
 NODES: tuple[type[io.ComfyNode], ...] = (
     MiniProbeLoader,
     EstimateDepth,
+    TurboLoRASwap,
     DepthBallMask,
     EVPromptInterp,
     ChromeBallInpaint,
     IterativeMedian,
     CanvasToImage,
     HDRMerge,
+    FitBall,
     BallToEquirect,
     EquirectToBall,
     SaveEnvMap,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from comfy_api.latest import io
 
 from ..dl_core.ball import Ball, crop_ball, require_canvas
-from ..dl_core.errors import ImageError
+from ..dl_core.ball_fit import BallFit
+from ..dl_core.errors import ImageError, OptionError
 from ..dl_core.geometry import ball_to_latlong, camera_rotation, latlong_coverage, latlong_to_ball, rotate_latlong
 from ..dl_core.projection import PROJECTIONS
-from .sockets import CATEGORY, BallSocket, as_rgb, named_output
+from .sockets import CATEGORY, BallFitSocket, BallSocket, as_rgb, named_output
 
-__all__ = ["BallToEquirect", "EquirectToBall"]
+__all__ = ["BallToEquirect", "EquirectToBall", "camera_inputs"]
 
 
 def _yaw_input(turned: str) -> io.Input:
@@ -25,13 +28,18 @@ def _yaw_input(turned: str) -> io.Input:
     )
 
 
-def _camera_inputs(frame: str) -> list[io.Input]:
-    """Widgets for how the camera sees the ball, the same on both nodes; appended, so that saved workflows load.
+def camera_inputs(
+    frame: str | None,
+    *,
+    fov: str = "Degrees that the whole picture spans along its longer side; used by perspective.",
+) -> list[io.Input]:
+    """Widgets for how the camera sees the ball, the same on all nodes; appended, so that saved workflows load.
 
     Args:
-        frame: tooltip of the width of the whole picture.
+        frame: tooltip of the width of the whole picture; None where a node knows it.
+        fov: tooltip of the field of view.
     """
-    return [
+    inputs = [
         io.Combo.Input(
             "projection",
             options=list(PROJECTIONS),
@@ -45,10 +53,12 @@ def _camera_inputs(frame: str) -> list[io.Input]:
             max=179.0,
             step=1.0,
             optional=True,
-            tooltip="Degrees that the whole picture spans along its longer side; used by perspective.",
+            tooltip=fov,
         ),
-        io.Float.Input("frame", default=4.0, min=1.0, max=64.0, step=0.1, optional=True, tooltip=frame),
     ]
+    if frame is not None:
+        inputs.append(io.Float.Input("frame", default=4.0, min=1.0, max=64.0, step=0.1, optional=True, tooltip=frame))
+    return inputs
 
 
 class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
@@ -76,9 +86,14 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                     tooltip="Samples along each side of a ball pixel; the footprint of each pixel of the map is always "
                     "covered, so 1 is enough.",
                 ),
-                *_camera_inputs(
+                *camera_inputs(
                     "Ball crops without a ball connected: how many ball diameters the whole picture is wide; "
                     "used by perspective."
+                ),
+                BallFitSocket.Input(
+                    "fit",
+                    optional=True,
+                    tooltip="Radius and centre as Fit Ball found them; the ball has to be connected too.",
                 ),
             ],
             outputs=[
@@ -103,17 +118,32 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
         projection: str = "orthographic",
         fov: float = 60.0,
         frame: float = 4.0,
+        fit: BallFit | None = None,
     ) -> io.NodeOutput:
         """Cut out, unwrap, turn."""
         crop = _cut_out(as_rgb(image, "image"), ball)
         size = crop.shape[1]
+        circle = _circle(fit, ball)
         camera = PROJECTIONS[projection](fov, *_picture(size, frame, ball))
-        latlong = ball_to_latlong(crop, height, samples=samples, painted=True, projection=camera)
-        coverage = latlong_coverage(height, size, projection=camera)[..., None]
+        latlong = ball_to_latlong(crop, height, samples=samples, painted=True, projection=camera, **circle)
+        coverage = latlong_coverage(height, size, projection=camera, **circle)[..., None]
         if yaw % 360:
             rotation = camera_rotation(yaw=yaw)
             latlong, coverage = (rotate_latlong(item, rotation) for item in (latlong, coverage))
         return io.NodeOutput(latlong, coverage[..., 0])
+
+
+def _circle(fit: BallFit | None, ball: Ball | None) -> dict[str, Any]:
+    """Radius and centre of a fitted ball in its crop; nothing without a fit.
+
+    Raises:
+        OptionError: a fit without the ball it belongs to.
+    """
+    if fit is None:
+        return {}
+    if ball is None:
+        raise OptionError("ball", None, "the ball that was fitted, whose crop the image is")
+    return {"radius": fit.radius, "centre": (fit.centre[0] - ball.left, fit.centre[1] - ball.top)}
 
 
 def _picture(size: int, frame: float, ball: Ball | None) -> tuple[float, tuple[float, float]]:
@@ -139,7 +169,7 @@ class EquirectToBall(io.ComfyNode):  # type: ignore[misc]
                 io.Image.Input("latlong", tooltip="A map, twice as wide as high; normally linear radiance."),
                 io.Int.Input("diameter", default=256, min=8, max=4096, tooltip="Side of the ball's picture, pixels."),
                 _yaw_input("before it is shown"),
-                *_camera_inputs("How many ball diameters the whole picture is wide; used by perspective."),
+                *camera_inputs("How many ball diameters the whole picture is wide; used by perspective."),
             ],
             outputs=[named_output(io.Image, "ball_image", "The ball, black around it, in the encoding of the map.")],
         )

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-import comfy.utils
 import folder_paths
 import torch
 from comfy_api.latest import io
@@ -14,8 +13,8 @@ from comfy_api.latest import io
 from ..dl_core.errors import ModelError, OptionError
 from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
 from ..dl_core.prompts import DARK_PROMPT, PROMPT
-from .lora import with_lora
-from .sockets import CATEGORY, as_rgb, named_output, parse_evs
+from .lora import read_lora_file, with_lora
+from .sockets import CATEGORY, as_rgb, named_output, parse_evs, parse_numbers
 
 __all__ = ["EVPromptInterp", "HDRMerge", "interpolate_conditioning"]
 
@@ -33,6 +32,7 @@ def interpolate_conditioning(original: Any, dark: Any, weight: float) -> Any:
 
     Raises:
         OptionError: conditionings of different numbers of items.
+        ModelError: conditionings without pooled embeddings, or of text encoders of different widths.
 
     Source: DiffusionLight, Sec. 4.2 (exposure LoRA: interpolated text embeddings).
     """
@@ -43,10 +43,34 @@ def interpolate_conditioning(original: Any, dark: Any, weight: float) -> Any:
 
 def _between(original: Any, dark: Any, weight: float) -> Any:
     (tokens, options), (dark_tokens, dark_options) = original, dark
+    if options.get("pooled_output") is None or dark_options.get("pooled_output") is None:
+        raise ModelError("conditionings", "hold no pooled embeddings; those of SDXL's text encoders are accepted")
+    if tokens.shape[-1] != dark_tokens.shape[-1]:
+        raise ModelError(
+            "conditionings",
+            f"are {tokens.shape[-1]} and {dark_tokens.shape[-1]} wide; two of the same text encoders are accepted",
+        )
     length = math.lcm(tokens.shape[1], dark_tokens.shape[1])
     tokens, dark_tokens = (item.repeat(1, length // item.shape[1], 1) for item in (tokens, dark_tokens))
     pooled = torch.lerp(options["pooled_output"], dark_options["pooled_output"], weight)
     return [torch.lerp(tokens, dark_tokens, weight), {**options, "pooled_output": pooled}]
+
+
+def _shares(evs: Sequence[float], ev_min: float, weights: str) -> list[float]:
+    """How far each EV lies from the prompt to the dark prompt: EV / EV min, or as written in `weights`.
+
+    Raises:
+        OptionError: an EV below `ev_min`, as no weights say what to do with it; weights that are no numbers from 0 to
+            1, or not one per EV.
+    """
+    if not weights.strip():
+        if evs[-1] < ev_min:
+            raise OptionError("evs", evs, f"EVs down to ev_min, {ev_min:g}, where the dark prompt stands alone")
+        return [ev / ev_min for ev in evs]
+    shares = parse_numbers(weights, "weights", "0, 0.5, 1")
+    if len(shares) != len(evs) or not all(0 <= share <= 1 for share in shares):
+        raise OptionError("weights", weights, f"one number from 0 to 1 per EV, that is {len(evs)}, or nothing")
+    return list(shares)
 
 
 class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
@@ -62,9 +86,15 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
             description="Makes one conditioning per exposure value, on the line from the prompt (EV 0) to the dark "
             "prompt (EV min). Nodes that follow run once per EV; HDR Merge gathers them again.",
             inputs=[
-                io.Clip.Input("clip", tooltip="Text encoders of the model."),
+                io.Clip.Input("clip", optional=True, tooltip="Text encoders of the model, for the prompts below."),
                 io.Model.Input(
                     "model", optional=True, tooltip="The denoiser, if this node is to load the LoRA into it."
+                ),
+                io.Conditioning.Input(
+                    "original", optional=True, tooltip="A conditioning for EV 0, in place of the prompt below."
+                ),
+                io.Conditioning.Input(
+                    "dark", optional=True, tooltip="A conditioning for EV min, in place of the dark prompt below."
                 ),
                 io.String.Input("prompt", default=PROMPT, multiline=True, tooltip="A mirror ball at EV 0."),
                 io.String.Input("dark_prompt", default=DARK_PROMPT, multiline=True, tooltip="A mirror ball at EV min."),
@@ -95,6 +125,13 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
                     step=0.05,
                     tooltip="How strongly the LoRA acts. The paper uses 0.75.",
                 ),
+                io.String.Input(
+                    "weights",
+                    default="",
+                    optional=True,
+                    tooltip="Share of the dark prompt at each EV, 0 to 1, between commas: 0, 0.5, 1. "
+                    "Nothing: EV / EV min, as in the paper.",
+                ),
             ],
             outputs=[
                 named_output(io.Model, "model", "The model, with the LoRA if one was chosen."),
@@ -106,22 +143,37 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
     @classmethod
     def execute(
         cls,
-        clip: Any,
         prompt: str,
         dark_prompt: str,
         evs: str,
         ev_min: float,
         lora: str,
         lora_scale: float,
+        weights: str = "",
+        clip: Any = None,
         model: Any = None,
+        original: Any = None,
+        dark: Any = None,
     ) -> io.NodeOutput:
         """Encode both prompts once and interpolate between these originals for every EV."""
         values = check_evs(parse_evs(evs))
-        if values[-1] < ev_min:
-            raise OptionError("evs", evs, f"EVs down to ev_min, {ev_min:g}, where the dark prompt stands alone")
-        original, dark = (clip.encode_from_tokens_scheduled(clip.tokenize(text)) for text in (prompt, dark_prompt))
-        positive = [interpolate_conditioning(original, dark, ev / ev_min) for ev in values]
+        shares = _shares(values, ev_min, weights)
+        bright, black = _encoded(clip, prompt, original), _encoded(clip, dark_prompt, dark)
+        positive = [interpolate_conditioning(bright, black, share) for share in shares]
         return io.NodeOutput(_with_lora(model, lora, lora_scale), positive, list(values))
+
+
+def _encoded(clip: Any, prompt: str, conditioning: Any) -> Any:
+    """The conditioning given in a prompt's place, or the prompt encoded.
+
+    Raises:
+        ModelError: neither a conditioning nor text encoders.
+    """
+    if conditioning is not None:
+        return conditioning
+    if clip is None:
+        raise ModelError("socket clip", "is not connected; connect it, or both original and dark in its place")
+    return clip.encode_from_tokens_scheduled(clip.tokenize(prompt))
 
 
 def _with_lora(model: Any, lora: str, scale: float) -> Any:
@@ -134,8 +186,7 @@ def _with_lora(model: Any, lora: str, scale: float) -> Any:
         return model
     if model is None:
         raise ModelError("socket model", "is not connected; it has to be for a LoRA to be loaded")
-    weights = comfy.utils.load_torch_file(folder_paths.get_full_path_or_raise("loras", lora), safe_load=True)
-    return with_lora(model, weights, scale, f"lora {lora}")
+    return with_lora(model, read_lora_file(lora), scale, f"lora {lora}")
 
 
 class HDRMerge(io.ComfyNode):  # type: ignore[misc]

@@ -1,7 +1,8 @@
 """ComfyPainter: the Painter port on ComfyUI's own sampling.
 
-With nodes/mini.py this is the only file that touches ComfyUI's internals: `comfy.sample.sample_custom`,
-`comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules), `comfy.model_management` (interruption, free memory),
+With nodes/from_diffusers.py and nodes/mini.py this is the only file that touches ComfyUI's internals:
+`comfy.sample.sample_custom`, `comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules),
+`comfy.model_management` (interruption, free memory),
 a model's `model_function_wrapper`, `model_sampling`, `model_config`, `memory_required`, `model_size`, `loaded_size` and
 `patches_uuid`, a ControlNet's `copy`, `set_cond_hint` and `get_models`, and a VAE's `encode`, `decode` and
 `first_stage_model`.
@@ -207,7 +208,7 @@ class ComfyPainter:
         def paint(seeds: tuple[int, ...]) -> BallImage:
             samples = comfy.sample.sample_custom(
                 model,
-                _noise(seeds, latent),
+                _noise(seeds, latent, after_posterior=_draws_posterior(self._networks.vae)),
                 self._guidance.cfg,
                 _sampler(self._guidance.sampler, model, from_noise=request.strength == 1),
                 sigmas.clone(),  # uni_pc writes into it
@@ -318,10 +319,28 @@ def _watched(model: Any, counter: _Counter) -> Any:
     return watched
 
 
-def _noise(seeds: tuple[int, ...], latent: torch.Tensor) -> torch.Tensor:
-    """Noise of each ball from its own seed, drawn on the CPU: a ball does not depend on its batch or device."""
-    shape = (1, *latent.shape[1:])
-    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+def _noise(seeds: tuple[int, ...], latent: torch.Tensor, *, after_posterior: bool) -> torch.Tensor:
+    """Noise of each ball from its own seed, drawn on the CPU: a ball does not depend on its batch or device.
+
+    Args:
+        seeds: of the balls.
+        latent: (1, ...) of the canvas.
+        after_posterior: whether a sample of the autoencoder's posterior is drawn first, as diffusers and the authors'
+            code do, so that a seed means the same noise here. ComfyUI takes the mode, and the draw itself is dropped.
+    """
+    return torch.cat([_draw(seed, (1, *latent.shape[1:]), after_posterior) for seed in seeds])
+
+
+def _draw(seed: int, shape: tuple[int, ...], after_posterior: bool) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    if after_posterior:
+        torch.randn(shape, generator=generator)
+    return torch.randn(shape, generator=generator)
+
+
+def _draws_posterior(vae: Any) -> bool:
+    """Whether a VAE encodes to a distribution, as SDXL's does, and not to latents, as TAESD does."""
+    return hasattr(vae.first_stage_model, "regularization")
 
 
 def _sampler(name: str, model: Any, *, from_noise: bool) -> Any:
@@ -333,7 +352,7 @@ def _sampler(name: str, model: Any, *, from_noise: bool) -> Any:
 
     def start_from_noise(inpaint: Any, x: torch.Tensor, sigmas: torch.Tensor, **options: Any) -> torch.Tensor:
         noise = sampling.noise_scaling(sigmas[0], inpaint.noise, torch.zeros_like(x), True)
-        return sampler.sampler_function(_FromNoise(inpaint), noise, sigmas, **options)
+        return sampler.sampler_function(_FromNoise(inpaint, noise / sigmas[0]), noise, sigmas, **options)
 
     return comfy.samplers.KSAMPLER(start_from_noise, sampler.extra_options, sampler.inpaint_options)
 
@@ -345,15 +364,16 @@ class _FromNoise:
     starts from noise everywhere and puts the photograph in after the first step.
     """
 
-    def __init__(self, inpaint: Any) -> None:
-        self._inpaint, self._latent = inpaint, inpaint.latent_image
-        inpaint.latent_image = torch.zeros_like(self._latent)
+    def __init__(self, inpaint: Any, start: torch.Tensor) -> None:
+        """Put a start in the place of the photograph, in units of the first noise level."""
+        self._inpaint, self._known = inpaint, (inpaint.latent_image, inpaint.noise)
+        inpaint.latent_image, inpaint.noise = torch.zeros_like(inpaint.latent_image), start
 
     def __call__(self, *arguments: Any, **options: Any) -> torch.Tensor:
         try:
             return self._inpaint(*arguments, **options)  # type: ignore[no-any-return]
         finally:
-            self._inpaint.latent_image = self._latent
+            self._inpaint.latent_image, self._inpaint.noise = self._known
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._inpaint, name)

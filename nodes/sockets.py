@@ -13,12 +13,24 @@ from comfy_api.latest import io
 
 from ..dl_core.errors import ImageError, OptionError
 
-__all__ = ["CATEGORY", "BallSocket", "DepthModelSocket", "as_rgb", "named_output", "parse_evs"]
+__all__ = [
+    "CATEGORY",
+    "BallFitSocket",
+    "BallSocket",
+    "DepthModelSocket",
+    "as_rgb",
+    "named_output",
+    "parse_evs",
+    "parse_numbers",
+]
 
 CATEGORY: Final = "LightProbe"
 
 BallSocket = io.Custom("BALL")
 """A `dl_core.ball.Ball`: where the ball sits on the canvas."""
+
+BallFitSocket = io.Custom("BALL_FIT")
+"""A `dl_core.ball_fit.BallFit`: radius and centre of a painted ball, as real numbers."""
 
 DepthModelSocket = io.Custom("DEPTH_MODEL")
 """What estimates depth, near bright, when called with an IMAGE: a `dl_core.depth.DepthModel`."""
@@ -46,7 +58,16 @@ def parse_evs(text: str) -> tuple[float, ...]:
     Raises:
         OptionError: something that is not a number.
     """
+    return parse_numbers(text, "evs", "0, -2.5, -5")
+
+
+def parse_numbers(text: str, name: str, example: str) -> tuple[float, ...]:
+    """Numbers written as text, between commas or semicolons.
+
+    Raises:
+        OptionError: something that is not a number; `name` and `example` say what was wanted.
+    """
     try:
         return tuple(float(part) for part in text.replace(";", ",").split(",") if part.strip())
     except ValueError as error:
-        raise OptionError("evs", text, "numbers between commas, such as 0, -2.5, -5") from error
+        raise OptionError(name, text, f"numbers between commas, such as {example}") from error

@@ -196,3 +196,14 @@ def _wait_until_up(server: Server, process: subprocess.Popen[bytes], timeout: fl
         except OSError:
             time.sleep(0.5)
     raise RuntimeError(f"ComfyUI did not start:\n{(server.base / 'server.log').read_text()[-4000:]}")
+
+
+def leading_euler(config: Any) -> Any:
+    """diffusers' Euler on the timesteps of the paper's schedule: a row for the backend's table of samplers."""
+    from diffusers import EulerDiscreteScheduler
+
+    class LeadingEuler(EulerDiscreteScheduler):
+        def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
+            super().set_timesteps(timesteps=pack_module("nodes.painter").leading_timesteps(num_inference_steps))
+
+    return LeadingEuler.from_config(config)

@@ -153,6 +153,25 @@ def test_maps_compared_as_pictures_are_toned_by_their_own_light(
     assert both["rmse"] < 0.2 * base["rmse"]
 
 
+def test_the_array_stands_beside_the_papers_table_and_a_bracket_beats_one_exposure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cameras = CAMERAS["array"]
+    monkeypatch.setitem(CAMERAS, "array", lambda key, seed: cameras(key, seed)[:1])
+    folder = lamp(tmp_path).parent
+    words = ("array", "--panoramas", folder, "--painter", "perfect", "--variants", "base,both")
+    report = protocol(capsys, *words, "--convention", "published-array", "--out", tmp_path / "out")
+    base, both = report["rows"]
+    assert {base["shot"], both["shot"]} == {"lamp.y0_p0_f50"}
+    assert {base["sphere"], both["sphere"]} == {"array"}
+    # One exposure ends at white; the bracket reaches the lamp.
+    assert both["si_rmse"] < 0.3 * base["si_rmse"]
+    assert (tmp_path / "out" / "sheets" / "both" / "lamp.y0_p0_f50.png").is_file()
+    published = {row["method"]: (row["si_rmse"], row["angular_error_deg"]) for row in report["protocol"]["published"]}
+    assert published["Weber et al."] == (0.081, 4.13)
+    assert len(published) == 5
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [

@@ -41,10 +41,10 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     return predicted, truth
 
 
-def run(folders: tuple[Path, Path], *options: object) -> None:
+def run(folders: tuple[Path, Path], *options: object, name: str = "three-spheres") -> None:
     parser = argparse.ArgumentParser()
     protocol.add_arguments(parser)
-    words = ["three-spheres", "--maps", folders[0], "--truth", folders[1], *options]
+    words = [name, "--maps", folders[0], "--truth", folders[1], *options]
     assert not protocol.run(parser.parse_args([str(word) for word in words]))
 
 
@@ -108,6 +108,30 @@ def test_a_run_reports_every_sphere_of_every_map(
     assert str(tmp_path) not in (out / "rows.jsonl").read_text(encoding="utf-8")
     # The last pair differs in exposure alone.
     assert all(row["si_rmse"] < 1e-4 for row in result["rows"] if row["panorama"] == "c")
+
+
+def test_the_array_is_scored_whole_and_its_medians_are_printed(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(folders, "--convention", "published-array", "--out", tmp_path / "out", name="array")
+    assert "median si-RMSE" in capsys.readouterr().out
+    report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    errors = {row["panorama"]: row for row in report["rows"]}
+    assert {row["sphere"] for row in report["rows"]} == {"array"}
+    (line,) = report["summary"]
+    assert line["si_rmse_median"] == sorted(row["si_rmse"] for row in report["rows"])[1]
+    # The last pair is twice as bright, everywhere: nothing of the frame is masked, and nothing is compressed.
+    assert errors["c"]["si_rmse"] < 1e-4
+    picture = scoring.render_nine(torch.ones(1, 16, 32, 3))["array"].pictures
+    assert errors["c"]["rmse"] == pytest.approx(float(picture.square().mean().sqrt()), rel=1e-4)
+
+
+@pytest.mark.parametrize(("name", "convention"), [("array", "published"), ("three-spheres", "published-array")])
+def test_a_convention_of_another_protocol_is_refused(name: str, convention: str, folders: tuple[Path, Path]) -> None:
+    with pytest.raises(
+        OptionError, match=rf"--convention is '{convention}'; accepted: .*radiance with protocol {name}"
+    ):
+        run(folders, "--convention", convention, name=name)
 
 
 def untimed(*records: dict[str, Any]) -> list[dict[str, Any]]:

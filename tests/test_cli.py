@@ -215,7 +215,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--preset", "fast"], "preset is 'fast'; accepted: draft, balanced, paper"),
+        (["--preset", "fast"], "preset is 'fast'; accepted: draft, balanced, turbo, paper"),
         (["--evs", "0,-2,-2"], "evs is"),
         (["--evs", "-1,-2"], "evs"),
         (["--evs=1,0"], "evs is"),
@@ -231,6 +231,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
         (["--seed", "one"], "--seed"),
         (["-o", "a.png"], "output is 'a.png'; accepted: a name that ends in .exr or .hdr"),
         (["--backend", "diffusers"], "model is None; accepted: a local file"),
+        (["--backend", "mini", "--turbo-lora", "x"], "turbo_lora is 'x'; accepted: nothing with the backend mini"),
         (["--backend", "mini", "--lora", "x"], "lora is 'x'; accepted: nothing with the backend mini"),
     ],
 )

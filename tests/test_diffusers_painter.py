@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from PIL import Image as PILImage
+from reference_pipeline import pipeline_canvases
 from tolerances import assert_close
 from torch import Tensor
 
@@ -62,39 +62,13 @@ def request_(ball: Ball) -> PaintRequest:
     return PaintRequest(canvas, paint_depth(None, ball), ball, -2.5, (11, 12), strength=1.0, steps=4)
 
 
-def _picture(values: Tensor) -> PILImage.Image:
-    return PILImage.fromarray((values * 255).round().byte().numpy())
-
-
 def _pipeline_balls(painter: DiffusersPainter, request: PaintRequest, sampler: str) -> Tensor:
     """What diffusers' pipeline paints for a request."""
     pipeline = painter.pipeline
-    kept, pipeline.scheduler = pipeline.scheduler, SAMPLERS[sampler](pipeline.scheduler.config)
-    guidance = painter.guidance_at(request.ev)
-    count = len(request.seeds)
-    mask = ball_latent_mask(request.ball)[0, 0].repeat_interleave(8, 0).repeat_interleave(8, 1)
-    pipeline.set_progress_bar_config(disable=True)
-    try:
-        canvas = pipeline(
-            image=_picture(request.canvas[0]),
-            mask_image=_picture(mask),
-            control_image=_picture(request.depth[0]),
-            prompt_embeds=guidance.tokens.expand(count, -1, -1),
-            pooled_prompt_embeds=guidance.pooled.expand(count, -1),
-            negative_prompt_embeds=guidance.negative_tokens.expand(count, -1, -1),
-            negative_pooled_prompt_embeds=guidance.negative_pooled.expand(count, -1),
-            guidance_scale=painter.defaults.guidance,
-            controlnet_conditioning_scale=painter.defaults.control_scale,
-            num_inference_steps=request.steps,
-            strength=request.strength,
-            height=SIDE,
-            width=SIDE,
-            generator=[torch.Generator().manual_seed(seed) for seed in request.seeds],
-            output_type="pt",
-        ).images
-    finally:
-        pipeline.scheduler = kept
-    return crop_ball(canvas.permute(0, 2, 3, 1).float(), request.ball)
+    scheduler = SAMPLERS[sampler](pipeline.scheduler.config)
+    guidance, mask = painter.guidance_at(request.ev), ball_latent_mask(request.ball)
+    canvases = pipeline_canvases(pipeline, scheduler, request, guidance, painter.defaults, mask)
+    return crop_ball(canvases, request.ball)
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)

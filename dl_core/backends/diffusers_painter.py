@@ -28,9 +28,11 @@ from torch import Tensor
 from ..ball import Ball, crop_ball, disc_mask, require_canvas
 from ..batches import Batches, is_out_of_memory
 from ..errors import ModelError, OptionError
+from ..lora import EXPOSURE_SCALE, LoraSwap
 from ..painter import Observer, PaintRequest, PaintResult, first_step
 from ..shapes import BallImage, Image
-from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults
+from .diffusers_lora import EXPOSURE, TURBO, add_lora
+from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults, read_weights
 
 __all__ = ["SAMPLERS", "DiffusersPainter", "Guidance", "Imputing", "ball_latent_mask"]
 
@@ -44,7 +46,7 @@ SAMPLERS: Final[dict[str, Callable[..., Any]]] = {
 Imputing = Literal["initial", "predicted"]
 
 PAPER_DEFAULTS: Final = ModelDefaults(
-    canvas=1024, diameter=256, guidance=5.0, control_scale=0.5, lora_scale=0.75, ev_min=-5.0
+    canvas=1024, diameter=256, guidance=5.0, control_scale=0.5, lora_scale=EXPOSURE_SCALE, ev_min=-5.0
 )
 """The paper's, and its authors' code's where the paper is silent."""
 
@@ -81,6 +83,8 @@ class DiffusersPainter:
         sampler: a name of `SAMPLERS`.
         batch: balls denoised at once; less memory with less. Where a batch does not fit, it is halved from there on.
         impute: noise put on what lies outside the mask (see the module).
+        lora_swap: when the pipeline's adapters `diffusers_lora.TURBO` and `EXPOSURE` act, in every pass; without it
+            the pipeline's adapters stay as they are.
     """
 
     def __init__(
@@ -91,6 +95,7 @@ class DiffusersPainter:
         sampler: str = "unipc",
         batch: int = 4,
         impute: Imputing = "initial",
+        lora_swap: LoraSwap | None = None,
     ) -> None:
         if sampler not in SAMPLERS:
             raise OptionError("sampler", sampler, ", ".join(SAMPLERS))
@@ -105,6 +110,8 @@ class DiffusersPainter:
         self.sampler = sampler
         self._batches = Batches(batch, _empty_cache)
         self.impute = impute
+        self.lora_swap = lora_swap
+        self._acting: tuple[str, float] | None = None
         self._embeddings: dict[str, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
 
     @staticmethod
@@ -121,23 +128,29 @@ class DiffusersPainter:
             scheduler=UniPCMultistepScheduler(**SCHEDULER_CONFIG, timestep_spacing="leading", steps_offset=1),
         )
         if model.lora is not None:
-            pipeline.load_lora_weights(dict(model.lora), adapter_name="exposure")
-            pipeline.set_adapters("exposure", model.defaults.lora_scale)
+            add_lora(pipeline, model.lora, EXPOSURE, "mini model's exposure LoRA")
+            pipeline.set_adapters(EXPOSURE, model.defaults.lora_scale)
         return DiffusersPainter(pipeline, model.defaults, **options)
 
     @staticmethod
-    def from_files(model: Path, controlnet: Path, lora: Path | None = None, **options: Any) -> DiffusersPainter:
+    def from_files(
+        model: Path, controlnet: Path, lora: Path | None = None, turbo_lora: Path | None = None, **options: Any
+    ) -> DiffusersPainter:
         """A painter on SDXL from local files; nothing is downloaded.
 
         Args:
             model: an SDXL checkpoint (.safetensors) or a folder in diffusers' layout.
             controlnet: a depth ControlNet for SDXL, file or folder.
             lora: the exposure LoRA, a file; without it the dark exposures rest on the prompt alone.
+            turbo_lora: the Turbo LoRA, a file; it takes the first timesteps of every pass, as `LoraSwap` says.
             options: as the constructor's.
 
         Raises:
+            OptionError: a Turbo LoRA without an exposure LoRA to follow it.
             ModelError: a file is missing, unreadable, or not of SDXL's architecture.
         """
+        if turbo_lora is not None and lora is None:
+            raise OptionError("turbo_lora", str(turbo_lora), "none without an exposure LoRA, which follows it")
         device = "cuda" if torch.cuda.is_available() else "cpu"
         dtype = torch.float16 if device == "cuda" else torch.float32
         base = _load(StableDiffusionXLPipeline, model, dtype)
@@ -147,7 +160,11 @@ class DiffusersPainter:
             raise ModelError(controlnet, "is not a ControlNet for SDXL (its text conditioning has another width)")
         pipeline = StableDiffusionXLControlNetInpaintPipeline(**base.components, controlnet=control)
         if lora is not None:
-            _load_lora(pipeline, lora)
+            add_lora(pipeline, read_weights(lora), EXPOSURE, lora)
+            pipeline.set_adapters(EXPOSURE, PAPER_DEFAULTS.lora_scale)
+        if turbo_lora is not None:
+            add_lora(pipeline, read_weights(turbo_lora), TURBO, turbo_lora)
+            options = {"lora_swap": LoraSwap(), **options}
         return DiffusersPainter(pipeline.to(device), PAPER_DEFAULTS, **options)
 
     def evaluations(self, balls: int, steps: int, strength: float) -> int:
@@ -208,6 +225,7 @@ class DiffusersPainter:
         per_step = self.evaluations(len(seeds), 1, 1.0)
         denoise = self._denoiser(request, len(seeds))
         for i, timestep in enumerate(timesteps):
+            self._choose_lora(float(timestep))
             predicted = denoise(scheduler.scale_model_input(latents, timestep), timestep)
             known_noise = (
                 noise if self.impute == "initial" else _predicted_noise(scheduler, predicted, latents, timestep)
@@ -280,6 +298,16 @@ class DiffusersPainter:
 
         return denoise
 
+    def _choose_lora(self, timestep: float) -> None:
+        """Let the LoRA act whose turn it is at a timestep."""
+        swap = self.lora_swap
+        if swap is None:
+            return
+        turn = (TURBO, swap.turbo_scale) if swap.turbo_at(timestep) else (EXPOSURE, swap.exposure_scale)
+        if turn != self._acting:
+            self.pipeline.set_adapters(*turn)
+            self._acting = turn
+
     def guidance_at(self, ev: float) -> Guidance:
         """Embeddings at an EV: ξ(ev) = ξ_o + (ev / EV_min) (ξ_d - ξ_o), tokens and pooled alike (Sec. 4.2)."""
         own, unwanted, own_pooled, unwanted_pooled = self._embed(self.defaults.prompt)
@@ -340,15 +368,3 @@ def _load(kind: Any, path: Path, dtype: torch.dtype) -> Any:
 def _require_sdxl(path: Path, unet: Any) -> None:
     if getattr(unet.config, "addition_embed_type", None) != "text_time" or unet.config.in_channels != 4:
         raise ModelError(path, "is not an SDXL base model (its UNet lacks SDXL's text-and-size conditioning)")
-
-
-def _load_lora(pipeline: Any, path: Path) -> None:
-    if not path.is_file():
-        raise ModelError(path, "no such LoRA file")
-    try:
-        pipeline.load_lora_weights(
-            str(path.parent), weight_name=path.name, adapter_name="exposure", local_files_only=True
-        )
-        pipeline.set_adapters("exposure", PAPER_DEFAULTS.lora_scale)
-    except Exception as error:
-        raise ModelError(path, f"is not a LoRA for this model ({type(error).__name__}: {error})") from error

@@ -25,20 +25,22 @@ class ModelFiles:
         model: checkpoint or folder; None for the backend's own, where it has one.
         controlnet: a depth ControlNet.
         lora: the exposure LoRA.
-        exposure_lora: whether an exposure LoRA is used at all, the backend's own included.
+        turbo_lora: the Turbo LoRA, which takes the first timesteps from the exposure LoRA.
+        exposure_lora: whether LoRAs are used at all, the backend's own included.
     """
 
     model: Path | None = None
     controlnet: Path | None = None
     lora: Path | None = None
+    turbo_lora: Path | None = None
     exposure_lora: bool = True
 
     @staticmethod
     def of(args: argparse.Namespace) -> ModelFiles:
-        """From the options `--model`, `--controlnet` and `--lora`."""
-        names = (args.model, args.controlnet, args.lora)
-        model, controlnet, lora = (None if name is None else Path(name) for name in names)
-        return ModelFiles(model, controlnet, lora)
+        """From the options `--model`, `--controlnet`, `--lora` and `--turbo-lora`."""
+        names = (args.model, args.controlnet, args.lora, args.turbo_lora)
+        model, controlnet, lora, turbo_lora = (None if name is None else Path(name) for name in names)
+        return ModelFiles(model, controlnet, lora, turbo_lora)
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def _quiet_libraries() -> None:
 
 
 def _load_mini(files: ModelFiles) -> LoadedPainter:
-    for name in ("controlnet", "lora"):
+    for name in ("controlnet", "lora", "turbo_lora"):
         if getattr(files, name) is not None:
             value = str(getattr(files, name))
             raise OptionError(name, value, "nothing with the backend mini: its folder holds all of it")
@@ -101,8 +103,8 @@ def _load_diffusers(files: ModelFiles) -> LoadedPainter:
     _quiet_libraries()
     from .diffusers_painter import DiffusersPainter
 
-    lora = files.lora if files.exposure_lora else None
-    painter = DiffusersPainter.from_files(files.model, files.controlnet, lora)
+    lora, turbo_lora = (files.lora, files.turbo_lora) if files.exposure_lora else (None, None)
+    painter = DiffusersPainter.from_files(files.model, files.controlnet, lora, turbo_lora)
     return LoadedPainter(painter, painter.defaults.canvas, painter.defaults.diameter)
 
 

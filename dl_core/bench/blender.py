@@ -1,6 +1,6 @@
-"""Balls rendered by Blender's Cycles, the independent judge of `spheres` and of the perspective unwrap.
+"""Balls rendered by Blender's Cycles, the independent judge of spheres, their array and the perspective unwrap.
 
-    python -m dl_core.bench.blender perspective|spheres OUT [NAME ...]
+    python -m dl_core.bench.blender perspective|spheres|array OUT [NAME ...]
 
 Needs `bpy` (extra `blender`), which wants numpy 1 and so an environment of its own. Nothing else of this package is
 imported but the maps: the judge shares no code with what it judges. Renders are written as linear half-float EXR, with
@@ -32,7 +32,7 @@ import OpenEXR
 
 from .blender_maps import DIRECTION_MAP_HEIGHT, Pixels, environment
 
-__all__ = ["Frame", "Material", "main", "perspective", "three_spheres"]
+__all__ = ["Frame", "Material", "main", "perspective", "sphere_array", "three_spheres"]
 
 
 # --- files --------------------------------------------------------------------------------------------------------
@@ -344,7 +344,65 @@ def _all_spheres(out: Path, names: list[str]) -> None:
         three_spheres(out, name)
 
 
-SETS: Final[dict[str, Callable[[Path, list[str]], None]]] = {"perspective": _all_perspective, "spheres": _all_spheres}
+# --- the array of spheres on a plane ---------------------------------------------------------------------------------
+
+_SPACING: Final = 2.89
+_ABOVE: Final = 14.6
+_ARRAY: Final = Frame(128, 128, math.degrees(2 * math.atan(36 / 2 / 50)), (0, 0, 128, 128))
+"""A 50 mm lens on a 36 mm sensor, in half of the authors' resolution."""
+_ARRAY_SAMPLES: Final = 1024
+
+
+def _plane(scene: Any, shader: Any, half: float) -> None:
+    mesh = bpy.data.meshes.new("plane")
+    corners = [(x * half, y * half, 0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    mesh.from_pydata(corners, [], [(0, 1, 2, 3)])
+    mesh.materials.append(shader)
+    scene.collection.objects.link(bpy.data.objects.new("plane", mesh))
+
+
+def sphere_array(out: Path, environment_name: str) -> None:
+    """Nine Lambertian spheres on a plane that fills the frame, seen from straight above; -Z of our axes is at the top.
+
+    In radii: a square lattice of 2.89, its diagonals along the sides of the picture, 14.6 below the camera.
+    """
+    scene = _empty_scene()
+    half = (_ABOVE + 1) * _ARRAY.width / 2 / _ARRAY.focal
+    step = _SPACING / math.sqrt(2)
+    with tempfile.TemporaryDirectory() as folder:
+        _light(scene, environment(environment_name, DIRECTION_MAP_HEIGHT), Path(folder))
+        shader = _shader("lambert")
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                _sphere(scene, shader, ((i + j) * step, (i - j) * step, 1), 1)
+        _plane(scene, shader, half)
+        _camera(scene, _ARRAY, (0, 0, _ABOVE + 1), -90)
+        facts = {
+            "panorama": environment_name,
+            "panorama_height": DIRECTION_MAP_HEIGHT,
+            "orientation": "seen from above: right of the picture is our +X, its top our -Z",
+            "spacing_in_radii": _SPACING,
+            "lattice": "3 x 3, at 45 degrees to the picture, on the plane",
+            "camera_above_centres_in_radii": _ABOVE,
+            "plane_half_side_in_radii": half,
+            "frame_px": [_ARRAY.width, _ARRAY.height],
+            "focal_px": _ARRAY.focal,
+            "lambert": MATERIALS["lambert"].base,
+            "diffuse_bounces": scene.cycles.diffuse_bounces,
+        }
+        _save(out / f"array_{environment_name}", scene, _ARRAY_SAMPLES // 2, facts)
+
+
+def _all_arrays(out: Path, names: list[str]) -> None:
+    for name in names or _PANORAMAS:
+        sphere_array(out, name)
+
+
+SETS: Final[dict[str, Callable[[Path, list[str]], None]]] = {
+    "perspective": _all_perspective,
+    "spheres": _all_spheres,
+    "array": _all_arrays,
+}
 """What can be rendered, by name: (folder, names of maps) -> files."""
 
 

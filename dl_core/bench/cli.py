@@ -33,6 +33,7 @@ class Bench:
 BENCHES: Final[dict[str, Bench]] = {
     "oracle": Bench("what unwrap and merge lose behind a perfect painter", ".oracle"),
     "geometry": Bench("what latlong -> ball -> latlong loses", ".geometry"),
+    "fit": Bench("how well radius and centre of a painted ball are found", ".fit"),
     "metrics": Bench("score a picture against the true one", ".pairs"),
     "protocol": Bench("score given maps by the paper's protocols", ".protocol"),
 }

@@ -18,7 +18,7 @@ from ..imageio import read_envmap
 from .journal import Journal
 from .pairs import ERROR_COLUMNS, protocol
 from .report import Column, Report, Row, median_and_worst, panorama_files, prepare_output, publish
-from .scoring import PROTOCOLS, score_maps, summarize_errors
+from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "pair_maps", "run"]
 
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             journal.add([{"panorama": predicted.stem, **row, **spent} for row in rows])
     summary = _summarize(journal.rows, PROTOCOLS[args.protocol].parts)
     report = Report("protocol", _description(args), journal.rows, summary, time.perf_counter() - started)
-    publish(report, args, rows=_ROWS, summary=_SUMMARY)
+    publish(report, args, rows=_ROWS, summary=(*_HEAD, *summary_columns(args.protocol, ERROR_COLUMNS), _TIME))
     return 0
 
 
@@ -103,9 +103,5 @@ def _summarize(rows: list[Row], parts: tuple[str, ...]) -> list[Row]:
 
 
 _ROWS: Final = (Column("panorama", "panorama"), Column("sphere", "sphere"), *ERROR_COLUMNS)
-_SUMMARY: Final = (
-    Column("sphere", "sphere"),
-    Column("maps", "panoramas"),
-    *(Column(f"mean {column.title}", column.key, column.form) for column in ERROR_COLUMNS),
-    Column("s an image, all spheres", "score_seconds", ".3f"),
-)
+_HEAD: Final = (Column("sphere", "sphere"), Column("maps", "panoramas"))
+_TIME: Final = Column("s an image, all spheres", "score_seconds", ".3f")

@@ -23,9 +23,17 @@ from .painters import PAINTERS, open_studio
 from .paintings import VARIANTS, Painting, paint_maps, planned
 from .published import PUBLISHED
 from .report import Column, Report, Row, panorama_files, prepare_output, publish, table
-from .scoring import PROTOCOLS, score_maps, summarize_errors
+from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "run"]
+
+
+_FILES: Final = {
+    "model": "checkpoint",
+    "controlnet": "depth ControlNet",
+    "lora": "exposure LoRA",
+    "turbo-lora": "Turbo LoRA",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--variants", default="both", help=f"rows of the ablation: {','.join(VARIANTS)}, or all (default: both)")
     add("--preset", default="draft", help="schedule and bracket (default: draft)")
     add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
-    for name, what in (("model", "checkpoint"), ("controlnet", "depth ControlNet"), ("lora", "exposure LoRA")):
+    for name, what in _FILES.items():
         add(f"--{name}", metavar="PATH", help=f"{what} of the painter, as for estimate")
 
 
@@ -70,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         seeds=(args.seed,),
         evaluations=sum({row["variant"] + row["shot"]: row["evaluations"] for row in rows}.values()),
     )
-    publish(report, args, rows=_ROWS, summary=_SUMMARY)
+    publish(report, args, rows=_ROWS, summary=(*_HEAD, *summary_columns(args.protocol, _FIGURE_COLUMNS)))
     if not args.json:
         sys.stdout.write(
             "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
@@ -80,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _identity(painter: str, files: ModelFiles) -> str:
     """Name of a painter with a fingerprint of where its files lie: the folders themselves are nobody else's affair."""
-    places = (files.model, files.controlnet, files.lora)
+    places = (files.model, files.controlnet, files.lora, files.turbo_lora)
     if not any(places):
         return painter
     text = "\n".join("" if place is None else str(place.resolve()) for place in places)
@@ -152,5 +160,5 @@ _FIGURE_COLUMNS: Final = (
     Column("normalized RMSE", "normalized_rmse", ".3f"),
 )
 _ROWS: Final = (Column("shot", "shot"), Column("variant", "variant"), Column("sphere", "sphere"), *_FIGURE_COLUMNS)
-_SUMMARY: Final = (Column("method", "method"), Column("sphere", "sphere"), Column("maps", "maps"), *_FIGURE_COLUMNS)
+_HEAD: Final = (Column("method", "method"), Column("sphere", "sphere"), Column("maps", "maps"))
 _PUBLISHED: Final = (Column("data", "data"), Column("method", "method"), Column("sphere", "sphere"), *_FIGURE_COLUMNS)

@@ -8,7 +8,7 @@ from ..errors import OptionError
 from . import given_maps, painted
 from .pairs import add_convention
 from .report import add_output
-from .scoring import PROTOCOLS
+from .scoring import PROTOCOLS, check_protocol
 
 __all__ = ["add_arguments", "run"]
 
@@ -27,8 +27,10 @@ def run(args: argparse.Namespace) -> int:
     """Score given maps, or paint and score.
 
     Raises:
-        OptionError: neither --panoramas nor both --maps and --truth, or all of them.
+        OptionError: neither --panoramas nor both --maps and --truth, or all of them; a convention that the protocol
+            is not scored by.
     """
+    check_protocol(args.protocol, args.convention)
     pair = (args.maps is not None, args.truth is not None)
     if args.panoramas is None and all(pair):
         return given_maps.run(args)

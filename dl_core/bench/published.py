@@ -49,7 +49,7 @@ def _spheres(
     return tuple(Published(protocol, data, method, *line) for line in zip(spheres, si, angle, normalized, strict=True))
 
 
-_LAVAL, _HAVEN = "Laval Indoor (289)", "Poly Haven (500)"
+_LAVAL, _HAVEN, _ARRAY = "Laval Indoor (289)", "Poly Haven (500)", "Laval Indoor (224)"
 
 PUBLISHED: Final[tuple[Published, ...]] = (
     *_spheres("three-spheres", _LAVAL, "base", (0.20, 0.45, 0.72), (5.87, 6.20, 8.28), (0.32, 0.47, 0.51)),
@@ -64,7 +64,11 @@ PUBLISHED: Final[tuple[Published, ...]] = (
     *_spheres(
         "three-spheres", _HAVEN, "base + iterative + LoRA", (0.14, 0.45, 0.66), (2.14, 3.60, 4.29), (0.20, 0.39, 0.43)
     ),
-    Published("array", "Laval Indoor (224)", "base + iterative + LoRA", "array", 0.090, 5.25),
+    Published("array", _ARRAY, "base + iterative + LoRA", "array", 0.090, 5.25),
+    Published("array", _ARRAY, "EverLight", "array", 0.091, 6.36),
+    Published("array", _ARRAY, "StyleLight", "array", 0.123, 7.09),
+    Published("array", _ARRAY, "Weber et al.", "array", 0.081, 4.13),
+    Published("array", _ARRAY, "EMLight", "array", 0.099, 3.99),
     *_spheres(
         "random-camera",
         _LAVAL,
@@ -76,4 +80,4 @@ PUBLISHED: Final[tuple[Published, ...]] = (
     Published("ldr", _LAVAL, "base + iterative + LoRA", "map", 0.303, 4.412, rmse=0.187),
     Published("ldr", _HAVEN, "base + iterative + LoRA", "map", 0.275, 4.567, rmse=0.179),
 )
-"""The paper's own method and its ablated versions."""
+"""The paper's own method and its ablated versions; of the array of spheres, other methods too."""

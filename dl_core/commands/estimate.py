@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("photo", metavar="PHOTO", help="photograph: JPEG, PNG, TIFF, WebP ...")
     add("-o", "--output", metavar="OUT.exr", required=True, help="map to write: .exr, or .hdr")
-    add("--preset", default="balanced", help="draft, balanced or paper: from fast to thorough (default: balanced)")
+    add("--preset", default="balanced", help="draft, balanced, turbo or paper (default: balanced)")
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
     add("--evs", metavar="0,-2.5,-5", help="exposures, descending from 0 (default: the preset's)")
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--model", metavar="PATH", help="diffusers: SDXL checkpoint; mini: another folder than its own")
     add("--controlnet", metavar="PATH", help="diffusers: depth ControlNet for SDXL")
     add("--lora", metavar="PATH", help="diffusers: exposure LoRA")
+    add("--turbo-lora", metavar="PATH", help="diffusers: Turbo LoRA for the first timesteps, with --preset turbo")
     add("--json", action="store_true", help="print the report as JSON")
 
 

@@ -17,7 +17,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
-WORKFLOWS = ("mini_quickstart", "paper_sdxl")
+WORKFLOWS = ("mini_quickstart", "paper_sdxl", "turbo")
 
 DIALOGS = """[...document.querySelectorAll('[role=dialog], .comfy-modal')]
     .filter(element => element.offsetParent !== null).map(element => element.innerText)"""

@@ -1,70 +1,71 @@
-"""Balls of ComfyPainter against DiffusersPainter on the mini model: `python tests/comfyui/bench_parity.py`.
+"""One set of weights in ComfyUI and in diffusers' own pipeline, stage by stage: `python tests/comfyui/bench_parity.py`.
 
-Same weights, initial noise, mask and timesteps. Euler shows that the paths agree; UniPC differs by design: ComfyUI's
-is of third order (bh1, bh2), diffusers' of second (bh2).
+SDXL's true topology at a tenth of its width (`toy_sdxl`) and the mini model. Then balls by sampler: Euler shows that
+the paths agree; UniPC differs by design, ComfyUI's being of third order (bh1, bh2), diffusers' of second (bh2).
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
 
 import torch  # noqa: E402
-from comfy_host import PHOTO, pack_module  # noqa: E402
+from comfy_host import leading_euler, pack_module  # noqa: E402
+from parity import (  # noqa: E402
+    Pair,
+    comfy_balls,
+    mini_pair,
+    pipeline_balls,
+    request_of,
+    stages,
+    toy_pair,
+)
 
-PAIRS = (("euler", "euler"), ("unipc", "uni_pc"), ("unipc", "uni_pc_bh2"))
-SCHEDULES = ((6, 1.0), (10, 0.8), (30, 1.0))
-SEEDS = (0, 1)
+SAMPLERS = ("euler", "uni_pc", "uni_pc_bh2")
 
 
-def on_paper_timesteps(config: Any) -> Any:
-    """diffusers' Euler on the timesteps of the paper's schedule."""
-    from diffusers import EulerDiscreteScheduler
+def print_stages(pair: Pair, steps: int) -> None:
+    """A row for each stage."""
+    print(f"{'stage':36}{'difference':>12}{'allowed':>10}  counted; reason for what remains")  # noqa: T201
+    for stage in stages(pair, steps):
+        print(  # noqa: T201
+            f"{stage.name:36}{stage.difference:12.1e}{stage.tolerance:10.0e}  {stage.measure}; {stage.reason}"
+        )
 
-    class LeadingEuler(EulerDiscreteScheduler):
-        def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
-            super().set_timesteps(timesteps=pack_module("nodes.painter").leading_timesteps(num_inference_steps))
 
-    return LeadingEuler.from_config(config)
+@torch.no_grad()
+def print_samplers(pair: Pair, steps: int) -> None:
+    """A row for each sampler and strength."""
+    print("sampler     strength  mean |difference|  99th percentile  contrast of the balls")  # noqa: T201
+    for sampler in SAMPLERS:
+        config = pair.pipeline.scheduler.config
+        for strength in (1.0, 0.8):
+            asked = request_of(pair, steps, strength)
+            reference = leading_euler(config) if sampler == "euler" else type(pair.pipeline.scheduler)(**config)
+            expected = pipeline_balls(pair, asked, reference)
+            difference = (comfy_balls(pair, asked, sampler) - expected).abs()
+            print(  # noqa: T201
+                f"{sampler:11} {strength:8.1f} {float(difference.mean()):18.6f} "
+                f"{float(difference.flatten().quantile(0.99)):16.6f} {float(expected.std()):22.3f}"
+            )
 
 
 def main() -> None:
-    """Print one row a sampler and schedule."""
-    painting, ports = pack_module("nodes.painter"), pack_module("dl_core.painter")
-    backend, balls = pack_module("dl_core.backends.diffusers_painter"), pack_module("dl_core.ball")
-    backend.SAMPLERS["euler"] = on_paper_timesteps
-    mini = replace(pack_module("dl_core.backends.mini").load_mini(), lora=None)
-    convert, defaults = pack_module("nodes.mini"), mini.defaults
-    clip = convert.to_clip(mini)
-    positive, negative = (
-        clip.encode_from_tokens_scheduled(clip.tokenize(text)) for text in (defaults.prompt, defaults.negative_prompt)
-    )
-    networks = painting.Networks(
-        convert.to_model(mini, 0), positive, negative, convert.to_vae(mini), convert.to_controlnet(mini)
-    )
-    ball = balls.place_ball(defaults.canvas, defaults.diameter)
-    canvas = balls.fit_canvas(pack_module("dl_core.imageio").read_photograph(PHOTO), defaults.canvas)
-    depth = balls.paint_depth(None, ball)
-    print("steps strength diffusers comfyui     mean |difference|  99th percentile  contrast of the balls")  # noqa: T201
-    for steps, strength in SCHEDULES:
-        asked = ports.PaintRequest(canvas, depth, ball, 0.0, SEEDS, strength=strength, steps=steps)
-        for theirs, ours in PAIRS:
-            guidance = painting.Guidance(
-                cfg=defaults.guidance, sampler=ours, control_strength=defaults.control_scale, batch_size=len(SEEDS)
-            )
-            reference = backend.DiffusersPainter.from_mini(mini, sampler=theirs)
-            expected = reference.paint(asked, ports.SilentObserver()).balls
-            with torch.inference_mode():
-                found = painting.ComfyPainter(networks, guidance).paint(asked, ports.SilentObserver()).balls
-            difference = (found - expected).abs()
-            print(  # noqa: T201
-                f"{steps:5} {strength:8.1f} {theirs:9} {ours:10} {float(difference.mean()):18.5f} "
-                f"{float(difference.flatten().quantile(0.99)):16.5f} {float(expected.std()):22.3f}"
-            )
+    """Both models, stage by stage, then sampler by sampler."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=30, help="of the trajectories (default: 30)")
+    steps = parser.parse_args().steps
+    for name, pair in (
+        ("SDXL's topology, random weights", toy_pair()),
+        ("mini model", mini_pair(pack_module("dl_core.backends.mini").load_mini())),
+    ):
+        print(f"\n{name}, {steps} steps")  # noqa: T201
+        print_stages(pair, steps)
+        print()  # noqa: T201
+        print_samplers(pair, steps)
 
 
 if __name__ == "__main__":

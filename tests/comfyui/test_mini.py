@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -95,45 +94,6 @@ def test_autoencoder(graph: Any, generator: torch.Generator) -> None:
     assert (graph.vae.decode(latents) - decoded).abs().max() < PIXELS
 
 
-LAYER = "down_blocks.2.attentions.0.transformer_blocks.0.attn1"
-NAMINGS: dict[str, Callable[[str, str], str]] = {
-    "peft": lambda layer, half: f"unet.{LAYER}.{layer}.lora_{'A' if half == 'down' else 'B'}.weight",
-    "peft with an adapter": lambda layer, half: (
-        f"base_model.model.{LAYER}.{layer}.lora_{'A' if half == 'down' else 'B'}.default.weight"
-    ),
-    "diffusers": lambda layer, half: f"unet.{LAYER}.{layer}.lora.{half}.weight",
-    "diffusers, processors": lambda layer, half: (
-        f"unet.{LAYER}.processor.{layer.removesuffix('.0')}_lora.{half}.weight"
-    ),
-    "kohya": lambda layer, half: f"lora_unet_{f'{LAYER}.{layer}'.replace('.', '_')}.lora_{half}.weight",
-}
-
-
-@pytest.mark.parametrize("naming", NAMINGS)
-@pytest.mark.parametrize("layer", ["to_q", "to_out.0"])
-def test_lora_of_any_naming_changes_its_layer_alone(
-    graph: Any, generator: torch.Generator, naming: str, layer: str
-) -> None:
-    down, up = torch.randn(4, 128, generator=generator), torch.randn(128, 4, generator=generator)
-    weights = {NAMINGS[naming](layer, "down"): down, NAMINGS[naming](layer, "up"): up}
-    patched = pack_module("nodes.lora").with_lora(graph.model, weights, 0.5, "test")
-    (key,) = patched.patches
-    assert key.endswith(f".attn1.{layer}.weight")
-    weight = graph.model.model_state_dict()[key]
-    patched.patch_model()
-    changed = patched.model.state_dict()[key].clone()
-    patched.unpatch_model()
-    torch.testing.assert_close(changed, weight + 0.5 * up @ down, rtol=1e-4, atol=1e-4)
-
-
-def test_lora_for_another_model_is_refused(graph: Any) -> None:
-    errors = pack_module("dl_core.errors")
-    with pytest.raises(errors.ModelError, match=r"lora x.*no weights for this model"):
-        pack_module("nodes.lora").with_lora(
-            graph.model, {"transformer.blocks.0.lora_A.weight": torch.ones(1)}, 1, "lora x"
-        )
-
-
 def test_loader_without_weights_says_which_file(mini: Any, tmp_path: Any) -> None:
     library, errors = pack_module("dl_core.backends.mini"), pack_module("dl_core.errors")
     (tmp_path / "tokenizer").symlink_to(library.MINI_FOLDER / "tokenizer")
@@ -147,6 +107,7 @@ def test_model_without_a_lora_is_left_as_it_is(mini: Any) -> None:
 
 
 def test_own_lora_is_loaded_at_its_scale(mini: Any) -> None:
-    weights = {NAMINGS["peft"]("to_q", "down"): torch.ones(4, 128), NAMINGS["peft"]("to_q", "up"): torch.ones(128, 4)}
+    layer = "unet.down_blocks.2.attentions.0.transformer_blocks.0.attn1.to_q"
+    weights = {f"{layer}.lora_A.weight": torch.ones(4, 128), f"{layer}.lora_B.weight": torch.ones(128, 4)}
     (patch,) = pack_module("nodes.mini").to_model(replace(mini, lora=weights), 0.75).patches.values()
     assert patch[0][0] == 0.75

@@ -144,7 +144,71 @@ def test_each_ev_lies_between_the_two_original_embeddings(node: Nodes, graph: An
         weight = ev / -5.0
         torch.testing.assert_close(tokens, original[0] + weight * (dark[0] - original[0]))
         torch.testing.assert_close(options["pooled_output"], original[1] + weight * (dark[1] - original[1]))
-    torch.testing.assert_close(positive[0][0][0], original[0], rtol=0, atol=0)
+    # At both ends they are the originals to the bit, and so is every EV whatever the others are.
+    for end, (tokens, pooled) in ((positive[0], original), (positive[-1], dark)):
+        assert torch.equal(end[0][0], tokens)
+        assert torch.equal(end[0][1]["pooled_output"], pooled)
+    alone = node("EVPromptInterp").execute(clip=graph.clip, **(STEERING | {"evs": "0, -1, -2.5"})).args[1][-1]
+    assert torch.equal(alone[0][0], positive[1][0][0])
+    assert torch.equal(alone[0][1]["pooled_output"], positive[1][0][1]["pooled_output"])
+
+
+def test_both_encoders_share_the_weight(node: Nodes, graph: Any) -> None:
+    """The first half of a token's embedding is the first encoder's, the second half the second's."""
+    _, positive, _ = node("EVPromptInterp").execute(clip=graph.clip, **(STEERING | {"evs": "0, -2, -5"})).args
+    first, between, last = (item[0][0] for item in positive)
+    for half in (slice(0, 32), slice(32, 64)):
+        step, whole = (between - first)[..., half], (last - first)[..., half]
+        assert whole.abs().max() > 1e-2
+        torch.testing.assert_close(step, 0.4 * whole, rtol=0, atol=1e-6)  # differences of numbers of order 1
+
+
+def test_weights_stand_in_for_the_evs(node: Nodes, graph: Any) -> None:
+    """They may leave the line of EV / EV min, and EVs below EV min are theirs to place."""
+    steering = STEERING | {"evs": "0, -2, -8", "weights": "0, 0.9, 1"}
+    _, positive, evs = node("EVPromptInterp").execute(clip=graph.clip, **steering).args
+    assert evs == [0.0, -2.0, -8.0]
+    (first, middle, last) = ((item[0][0], item[0][1]["pooled_output"]) for item in positive)
+    for part in (0, 1):
+        torch.testing.assert_close(middle[part], 0.1 * first[part] + 0.9 * last[part], rtol=0, atol=1e-6)
+    dark, _ = graph.clip.encode_from_tokens(graph.clip.tokenize(PROMPTS["dark_prompt"]), return_pooled=True)
+    assert torch.equal(last[0], dark)
+
+
+@pytest.mark.parametrize("weights", ["0, 1", "0, 0.5, 1.5", "-0.1, 0, 1", "0, nan, 1", "0, 0.5, 1, 1"])
+def test_weights_that_do_not_fit_the_evs_are_refused(node: Nodes, graph: Any, weights: str) -> None:
+    with pytest.raises(errors().OptionError, match=r"weights is .*one number from 0 to 1 per EV, that is 3"):
+        node("EVPromptInterp").execute(clip=graph.clip, **(STEERING | {"weights": weights}))
+
+
+def test_weights_that_are_no_numbers_are_refused(node: Nodes, graph: Any) -> None:
+    with pytest.raises(errors().OptionError, match=r"weights is '0, dark'.*numbers between commas, such as 0, 0\.5"):
+        node("EVPromptInterp").execute(clip=graph.clip, **(STEERING | {"weights": "0, dark"}))
+
+
+def test_conditionings_stand_in_for_the_prompts(node: Nodes, graph: Any) -> None:
+    """Of any node that encodes: with the same prompts the outcome is the same, and no text encoder is needed."""
+    original, dark = (graph.clip.encode_from_tokens_scheduled(graph.clip.tokenize(text)) for text in PROMPTS.values())
+    from_prompts = node("EVPromptInterp").execute(clip=graph.clip, **STEERING).args[1]
+    from_both = node("EVPromptInterp").execute(original=original, dark=dark, **STEERING).args[1]
+    mixed = node("EVPromptInterp").execute(clip=graph.clip, dark=dark, **STEERING).args[1]
+    for expected, *found in zip(from_prompts, from_both, mixed, strict=True):
+        for item in found:
+            assert torch.equal(item[0][0], expected[0][0])
+            assert torch.equal(item[0][1]["pooled_output"], expected[0][1]["pooled_output"])
+
+
+def test_conditionings_that_cannot_be_interpolated_are_refused(node: Nodes, graph: Any) -> None:
+    run = node("EVPromptInterp").execute
+    whole = [[torch.zeros(1, 77, 64), {"pooled_output": torch.zeros(1, 32)}]]
+    with pytest.raises(errors().ModelError, match=r"socket clip: is not connected; .*original and dark"):
+        run(original=whole, **STEERING)
+    with pytest.raises(errors().ModelError, match="conditionings: hold no pooled embeddings"):
+        run(original=whole, dark=[[torch.zeros(1, 77, 64), {"pooled_output": None}]], **STEERING)
+    with pytest.raises(errors().ModelError, match="conditionings: are 64 and 768 wide"):
+        run(original=whole, dark=[[torch.zeros(1, 77, 768), {"pooled_output": torch.zeros(1, 32)}]], **STEERING)
+    with pytest.raises(errors().OptionError, match="dark_prompt is '2 conditionings'"):
+        run(original=whole, dark=whole * 2, **STEERING)
 
 
 def test_prompts_of_different_lengths_are_interpolated(node: Nodes, graph: Any) -> None:
@@ -404,6 +468,31 @@ def test_yaw_turns_the_world_to_the_right(node: Nodes) -> None:
 def test_oblong_ball_is_refused(node: Nodes) -> None:
     with pytest.raises(errors().ImageError, match="image: is 8 x 4 pixels; a square ball crop"):
         node("BallToEquirect").execute(torch.rand(1, 4, 8, 3), height=8, yaw=0.0, samples=1)
+
+
+def test_a_fitted_circle_is_what_is_unwrapped(node: Nodes) -> None:
+    library = pack_module("dl_core.ball_fit")
+    place = pack_module("dl_core.ball").place_ball(256, 64)
+    fit = library.BallFit(31.4, (128.6, 127.7), (0.01, 0.01, 0.01), clear=True, reason="", explained=1.0)
+    crop = torch.rand(1, 64, 64, 3)
+    options = {"height": 32, "yaw": 0.0, "samples": 1}
+    found, coverage = node("BallToEquirect").execute(crop, ball=place, fit=fit, **options).args
+    geometry = pack_module("dl_core.geometry")
+    circle = {"radius": 31.4, "centre": (32.6, 31.7)}
+    torch.testing.assert_close(found, geometry.ball_to_latlong(crop, 32, painted=True, **circle))
+    torch.testing.assert_close(coverage, geometry.latlong_coverage(32, 64, **circle))
+    with pytest.raises(errors().OptionError, match="ball"):
+        node("BallToEquirect").execute(crop, fit=fit, **options)
+
+
+def test_fit_ball_keeps_the_circle_asked_for_where_nothing_tells(node: Nodes) -> None:
+    place = pack_module("dl_core.ball").place_ball(256, 64)
+    grey = torch.full((1, 64, 64, 3), 0.5)
+    fit, report = node("FitBall").execute([grey, grey], [torch.full((1, 256, 256, 3), 0.5)], [place]).args
+    assert (fit.radius, fit.centre, fit.clear) == (32.0, place.centre, False)
+    assert fit.reason in report
+    with pytest.raises(errors().ImageError, match="balls"):
+        node("FitBall").execute([grey[:, :32]], [torch.full((1, 256, 256, 3), 0.5)], [place])
 
 
 def smooth_latlong(height: int = 64) -> torch.Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import comfy_host
 import pytest
 import torch
 from comfy_host import pack_module
@@ -202,14 +203,8 @@ def diffusers_painter(mini: Any, sampler: str, guidance: float, control: float) 
 @pytest.fixture
 def leading_euler(monkeypatch: pytest.MonkeyPatch) -> str:
     """diffusers' Euler on the paper's timesteps, as one more row of the backend's table."""
-    from diffusers import EulerDiscreteScheduler
-
-    class LeadingEuler(EulerDiscreteScheduler):
-        def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
-            super().set_timesteps(timesteps=pack_module("nodes.painter").leading_timesteps(num_inference_steps))
-
     table = pack_module("dl_core.backends.diffusers_painter").SAMPLERS
-    monkeypatch.setitem(table, "leading_euler", lambda config: LeadingEuler.from_config(config))
+    monkeypatch.setitem(table, "leading_euler", comfy_host.leading_euler)
     return "leading_euler"
 
 

@@ -13,8 +13,9 @@ from comfy_host import REPOSITORY, load_pack, pack_module
 SOCKETS = {
     "MiniProbeLoader": ("", "model clip vae control_net"),
     "EstimateDepth": ("image", "depth depth_model"),
+    "TurboLoRASwap": ("model", "model"),
     "DepthBallMask": ("image depth", "canvas_image control_depth mask ball"),
-    "EVPromptInterp": ("clip model", "model positive ev"),
+    "EVPromptInterp": ("clip model original dark", "model positive ev"),
     "ChromeBallInpaint": (
         "model positive negative vae control_net image depth ball mask ev",
         "balls composite evaluations",
@@ -25,7 +26,8 @@ SOCKETS = {
     ),
     "CanvasToImage": ("canvas_image image ball", "image framed mask"),
     "HDRMerge": ("balls ev report", "hdr report"),
-    "BallToEquirect": ("image ball", "latlong coverage"),
+    "FitBall": ("balls photograph ball", "fit report"),
+    "BallToEquirect": ("image ball fit", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),
     "SaveEnvMap": ("latlong report", "path"),
     "LoadEnvMap": ("", "latlong"),
@@ -96,6 +98,8 @@ def test_defaults_are_the_papers(schemas: dict[str, Any]) -> None:
     assert pack_module("nodes.sockets").parse_evs(steering["evs"]) == paper
     assert steering["ev_min"] == -5.0
     assert steering["lora_scale"] == 0.75
+    turbo = {item.id: getattr(item, "default", None) for item in schemas["TurboLoRASwap"].inputs}
+    assert (turbo["turbo_scale"], turbo["exposure_scale"], turbo["timestep"]) == (1.0, 0.75, 800)
 
 
 def test_importing_the_pack_needs_no_comfyui() -> None:

@@ -6,19 +6,26 @@ import asyncio
 import json
 import re
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
+import torch
 from comfy_host import REPOSITORY, Server, pack_module
+from lora_files import RandomLora, attention_layers
+from safetensors.torch import save_file
 
-WORKFLOWS = ("mini_quickstart", "paper_sdxl")
+WORKFLOWS = ("mini_quickstart", "paper_sdxl", "turbo")
+WIDGETS = ("INT", "FLOAT", "STRING", "BOOLEAN", "COMBO")
 FILE_INPUTS = {
     ("LoadImage", "image"),
     ("CheckpointLoaderSimple", "ckpt_name"),
     ("ControlNetLoader", "control_net_name"),
     ("LoraLoader", "lora_name"),
+    ("TurboLoRASwap", "turbo_lora"),
+    ("TurboLoRASwap", "exposure_lora"),
 }
 """Inputs that name a file of the user's: their values need not be on offer."""
 
@@ -96,8 +103,79 @@ def test_paper_workflow_has_the_papers_settings() -> None:
     assert nodes["HDRMerge"]["method"] == "paper"
 
 
-def test_server_accepts_the_paper_workflow_but_for_files_it_lacks(server: Server) -> None:
-    answer = server.post("/prompt", {"prompt": workflow("paper_sdxl")})
+def test_turbo_workflow_has_the_authors_settings() -> None:
+    nodes = {node["class_type"]: node["inputs"] for node in workflow("turbo").values()}
+    assert nodes["IterativeMedian"]["preset"] == "turbo"
+    turbo = pack_module("dl_core.presets").preset("turbo")
+    assert (turbo.rounds.rounds, turbo.rounds.steps, turbo.guided_steps) == (0, 30, 90)
+    swap = nodes["TurboLoRASwap"]
+    assert (swap["timestep"], swap["turbo_scale"], swap["exposure_scale"]) == (800, 1.0, 0.75)
+    assert nodes["EVPromptInterp"]["lora"] == "none"
+    assert not {"LoraLoader", "LoraLoaderModelOnly"} & nodes.keys()
+
+
+@pytest.mark.parametrize("name", ["turbo", "paper_sdxl"])
+def test_graph_form_and_api_form_say_the_same(info: dict[str, Any], name: str) -> None:
+    """Links by node and socket; widgets in the order the server declares them."""
+    graph = json.loads((REPOSITORY / "workflows" / f"{name}.json").read_text())
+    links = {link[0]: [str(link[1]), link[2]] for link in graph["links"]}
+    nodes = {str(node["id"]): node for node in graph["nodes"] if "Note" not in node["type"]}
+    prompt = workflow(name)
+    assert nodes.keys() == prompt.keys()
+    for number, node in nodes.items():
+        linked = {item["name"]: links[item["link"]] for item in node["inputs"] if item["link"] is not None}
+        wanted = {key: value for key, value in prompt[number]["inputs"].items() if isinstance(value, list)}
+        assert linked == wanted, node["type"]
+        values = iter(value for value in node["widgets_values"] if value not in ("fixed", "image"))
+        kinds = info[node["type"]]["input"]
+        for key, spec in (kinds["required"] | kinds.get("optional", {})).items():
+            if isinstance(spec[0], list) or (spec[0] in WIDGETS and not spec[1].get("forceInput")):
+                found = next(values, "")
+                assert found == prompt[number]["inputs"].get(key, ""), f"{node['type']}.{key}"
+        assert not list(values), node["type"]
+
+
+@pytest.fixture
+def lora_files(server: Server, generator: torch.Generator) -> Iterator[dict[str, str]]:
+    """Two random LoRAs in the server's folder, by the socket that takes them."""
+    mini = pack_module("dl_core.backends.mini").load_mini()
+    layers = pack_module("dl_core.backends.diffusers_lora").lora_shapes(mini.unet)
+    shapes, names = attention_layers(layers), pack_module("dl_core.lora_names").comfyui_layers(layers)
+    folder = server.base / "models" / "loras"
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {"turbo_lora": "kohya for SDXL", "exposure_lora": "diffusers, attention processors"}
+    for socket, convention in files.items():
+        save_file(RandomLora.on(shapes, generator).written(convention, names), folder / f"{socket}.safetensors")
+    yield {socket: f"{socket}.safetensors" for socket in files}
+    for socket in files:
+        (folder / f"{socket}.safetensors").unlink()
+
+
+def test_turbo_runs_on_the_mini_model(server: Server, lora_files: dict[str, str]) -> None:
+    """The quickstart's graph with the swap before it; six steps visit 853 and then 711 ...: one lies before it."""
+    prompt = workflow("mini_quickstart")
+    loader = next(number for number, node in prompt.items() if node["class_type"] == "MiniProbeLoader")
+    prompt[loader]["inputs"]["lora_scale"] = 0.0
+    for node in prompt.values():
+        for socket, value in node["inputs"].items():
+            if value == [loader, 0]:
+                node["inputs"][socket] = ["turbo", 0]
+        if node["class_type"] == "IterativeMedian":
+            node["inputs"] |= {"preset": "custom", "balls": 1, "rounds": 0, "steps": 6}
+    scales = {"turbo_scale": 1.0, "exposure_scale": 0.75, "timestep": 800}
+    prompt["turbo"] = {"class_type": "TurboLoRASwap", "inputs": {"model": [loader, 0], **lora_files, **scales}}
+    entry = server.run(prompt)
+    assert entry["status"]["status_str"] == "success", entry["status"]
+    (file,) = [file for output in entry["outputs"].values() for file in output.get("envmaps", [])]
+    header = pack_module("dl_core.imageio").read_exr_header(
+        server.base / "output" / file["subfolder"] / file["filename"]
+    )
+    assert header["lightprobe"].count("12 denoiser evaluations") == 3
+
+
+@pytest.mark.parametrize("name", ["paper_sdxl", "turbo"])
+def test_server_accepts_a_workflow_of_sdxl_but_for_files_it_lacks(server: Server, name: str) -> None:
+    answer = server.post("/prompt", {"prompt": workflow(name)})
     complaints = [error for node in answer["node_errors"].values() for error in node["errors"]]
     assert complaints
     named = {error["extra_info"].get("input_name") for error in complaints}
