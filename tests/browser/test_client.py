@@ -17,7 +17,7 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
-WORKFLOWS = ("mini_quickstart", "paper_sdxl", "turbo")
+WORKFLOWS = ("mini_quickstart", "paper_sdxl", "sdxl_fast", "base_only", "lora_only", "turbo")
 
 DIALOGS = """[...document.querySelectorAll('[role=dialog], .comfy-modal')]
     .filter(element => element.offsetParent !== null).map(element => element.innerText)"""

@@ -17,7 +17,7 @@ from comfy_host import REPOSITORY, Server, pack_module
 from lora_files import RandomLora, attention_layers
 from safetensors.torch import save_file
 
-WORKFLOWS = ("mini_quickstart", "paper_sdxl", "turbo")
+WORKFLOWS = ("mini_quickstart", "paper_sdxl", "sdxl_fast", "base_only", "lora_only", "turbo")
 WIDGETS = ("INT", "FLOAT", "STRING", "BOOLEAN", "COMBO")
 FILE_INPUTS = {
     ("LoadImage", "image"),
@@ -101,6 +101,26 @@ def test_paper_workflow_has_the_papers_settings() -> None:
     assert (nodes["LoraLoader"]["strength_model"], nodes["LoraLoader"]["strength_clip"]) == (0.75, 0.0)
     assert nodes["EVPromptInterp"]["lora"] == "none"
     assert nodes["HDRMerge"]["method"] == "paper"
+
+
+@pytest.mark.parametrize(
+    ("name", "guided_steps", "lora"),
+    [("paper_sdxl", 4932, True), ("sdxl_fast", 450, True), ("lora_only", 90, True), ("base_only", 30, False)],
+)
+def test_workflows_cost_what_their_notes_say(name: str, guided_steps: int, lora: bool) -> None:
+    presets, rounds = pack_module("dl_core.presets"), pack_module("dl_core.iterative")
+    nodes = {node["class_type"]: node["inputs"] for node in workflow(name).values()}
+    paint = nodes["IterativeMedian"]
+    schedule = rounds.Rounds(**{key: paint[key] for key in ("balls", "rounds", "strength", "steps", "final")})
+    evs = tuple(float(ev) for ev in nodes["EVPromptInterp"]["evs"].split(","))
+    assert presets.Preset(schedule, evs, name).guided_steps == guided_steps
+    assert ("LoraLoader" in nodes) == lora
+    note = next(
+        node["widgets_values"][0]
+        for node in json.loads((REPOSITORY / "workflows" / f"{name}.json").read_text())["nodes"]
+        if node["type"] == "MarkdownNote"
+    )
+    assert f"{guided_steps:,} guided steps" in note
 
 
 def test_turbo_workflow_has_the_authors_settings() -> None:
