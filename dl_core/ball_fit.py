@@ -52,6 +52,10 @@ GRAIN: Final = 8 / 255
 """Error of one value of the ring: an 8-bit step or two, and sixteen values erring together."""
 LARGEST_ERROR: Final = 0.03
 """Standard deviation, pixels, up to which a fit is used: three are half a degree, 20 degrees from straight ahead."""
+LARGEST_BLUR: Final = 0.1
+"""Variance of blur, px², from which a fit is not used: how values of a rim mix in a painter is not known, and radii
+were off by a tenth of a pixel at 0.3. Balls that were not blurred measure at most 0.01.
+"""
 LEAST_EXPLAINED: Final = 0.8
 LEAST_SECTORS: Final = 12
 
@@ -363,6 +367,7 @@ def _judged(scene: _Scene, ball: Ball, solution: _Solution) -> BallFit:
         "too little of the ring shows what the photograph does": int((used > 20).sum()) < LEAST_SECTORS,
         "the ring is not a mirror image of the photograph": explained < LEAST_EXPLAINED,
         "the best fit is at the border of the search": float(offset.abs().max()) > REACH - 0.2,
+        "the ring is blurred": float(solution.parameters[4]) > LARGEST_BLUR,
         "the ring leaves radius or centre open": not max(sigma) < LARGEST_ERROR,
     }
     reason = next((text for text, fault in faults.items() if fault), "")
