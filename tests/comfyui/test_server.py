@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import pytest
 import torch
 from comfy_host import REPOSITORY, Server, pack_module
@@ -280,6 +279,8 @@ def interrupt_at(server: Server, prompt: dict[str, Any], evaluations: int) -> di
     """Queue a prompt, interrupt it once its second exposure is so far; its entry of the history."""
 
     async def follow() -> str:
+        import aiohttp  # comes with ComfyUI, not with this package
+
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{server.url}/ws?clientId=test") as socket:
             body = {"prompt": prompt, "client_id": "test"}
             async with session.post(f"{server.url}/prompt", json=body) as answer:
