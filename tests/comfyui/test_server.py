@@ -320,3 +320,16 @@ def test_a_graph_queued_again_goes_on_where_it_was_interrupted(server: Server) -
     assert taken["0"] == "9"
     # Two were finished when the interrupt was sent; a few small ones more until it arrived.
     assert 2 <= int(taken["-2.5"]) < 9
+
+
+def test_an_exposure_changed_is_all_that_is_painted_anew(server: Server, quickstart: dict[str, Any]) -> None:
+    prompt = workflow("mini_quickstart")
+    for node in prompt.values():
+        if node["class_type"] == "EVPromptInterp":
+            node["inputs"]["evs"] = "0, -2.5, -4"
+    entry = server.run(prompt)
+    (saved,) = [output["envmaps"][0] for output in entry["outputs"].values() if "envmaps" in output]
+    path = server.base / "output" / saved["subfolder"] / saved["filename"]
+    report = pack_module("dl_core.imageio").read_exr_header(path)["lightprobe"]
+    spent = dict(re.findall(r"EV (\S+): .*?; (\d+) denoiser evaluations", report))
+    assert spent == {"0": "0", "-2.5": "0", "-4": "36"}
