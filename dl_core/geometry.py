@@ -11,11 +11,13 @@ covers 4 / R² sr. The centre reflects what is behind the camera; the whole rim 
 
 Resampling averages several bilinear samples spread over each output pixel, weighted by solid angle, which is what
 keeps energy: a single sample aliases wherever the footprint of an output pixel is long and thin (near the rim).
-Bilinear samples are a partition of unity, so the interior of a ball keeps its energy by itself; the rim, where the
-outer 5% of the radius hold a tenth of the sphere, keeps it by weights fitted to that end (`_rim_weights`).
+Bilinear samples are a partition of unity, so the interior of a ball keeps its energy by itself; at the rim, where the
+outer 5% of the radius hold a tenth of the sphere, unwrapping balances its weights to that end (`footprints`).
 
-Sources: DiffusionLight, Sec. 4 and Fig. 3; the equal-area property follows from dω = 4 cos θ dA for a unit sphere;
-the rim's weights from Sinkhorn and Knopp, Concerning nonnegative matrices and doubly stochastic matrices (1967).
+Values are interpolated as they are. Measured on round trips of panoramas (`lightprobe bench geometry`), linear radiance
+keeps energy and irradiance best, and display-encoded values what a display shows; maps are lights first.
+
+Sources: DiffusionLight, Sec. 4 and Fig. 3; the equal-area property follows from dω = 4 cos θ dA for a unit sphere.
 """
 
 from __future__ import annotations
