@@ -32,10 +32,10 @@ from .report import (
     Row,
     add_output,
     add_panoramas,
-    median_and_worst,
     panorama_files,
     prepare_output,
     publish,
+    summarize_groups,
 )
 
 __all__ = ["SPACES", "UNWRAPS", "add_arguments", "ball_energy", "bench_geometry", "run", "summarize"]
@@ -205,13 +205,4 @@ def _shown_error(again_hdr: Latlong, truth_hdr: Latlong) -> Row:
 
 def summarize(rows: list[Row]) -> list[Row]:
     """Median and worst over the panoramas, a row for each diameter, unwrap and space."""
-    names = ("ball_px", "unwrap", "space")
-    summary = []
-    for labels in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
-        of_case = [row for row in rows if tuple(row[name] for name in names) == labels]
-        line: Row = {**dict(zip(names, labels, strict=True)), "panoramas": len(of_case)}
-        for key, ideal in IDEALS.items():
-            known = [row for row in of_case if row[key] is not None]
-            line |= median_and_worst(known, key, ideal=ideal) if known else {key: None}
-        summary.append(line)
-    return summary
+    return summarize_groups(rows, ("ball_px", "unwrap", "space"), IDEALS)

@@ -8,14 +8,13 @@ the rows as they are.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import time
 from pathlib import Path
 from typing import Final
 
 from ..errors import ImageError, OptionError
 from ..imageio import read_envmap
-from .journal import Journal
+from .journal import Journal, fingerprint
 from .pairs import ERROR_COLUMNS, protocol
 from .report import Column, Report, Row, median_and_worst, panorama_files, prepare_output, publish
 from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
@@ -82,10 +81,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _identity(args: argparse.Namespace) -> Row:
     """What has to be the same for a run to be gone on with; folders only as a fingerprint."""
-    folders = f"{args.maps.resolve()}\n{args.truth.resolve()}"
-    fingerprint = hashlib.sha256(folders.encode()).hexdigest()[:16]
-    parts = list(PROTOCOLS[args.protocol].parts)
-    return {"protocol": args.protocol, "convention": args.convention, "spheres": parts, "folders": fingerprint}
+    return {
+        "protocol": args.protocol,
+        "convention": args.convention,
+        "spheres": list(PROTOCOLS[args.protocol].parts),
+        "folders": fingerprint(args.maps, args.truth),
+    }
 
 
 def _description(args: argparse.Namespace) -> Row:

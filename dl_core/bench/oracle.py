@@ -10,7 +10,6 @@ A run with `--out` keeps its rows in `rows.jsonl` panorama by panorama, and goes
 from __future__ import annotations
 
 import argparse
-import hashlib
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +30,7 @@ from ..metrics import angular_error, energy_kept, irradiance, si_rmse, spread_di
 from ..presets import PAPER_EVS
 from ..shapes import BallImage, Latlong
 from .charts import bar_chart
-from .journal import Journal
+from .journal import Journal, fingerprint
 from .misalign import MISALIGNMENTS, misaligned_bracket
 from .reference import reference_merge, reference_unwrap
 from .report import (
@@ -40,10 +39,10 @@ from .report import (
     Row,
     add_output,
     add_panoramas,
-    median_and_worst,
     panorama_files,
     prepare_output,
     publish,
+    summarize_groups,
 )
 
 __all__ = ["EXPOSURES", "UNWRAPS", "WAYS", "Case", "add_arguments", "bench_oracle", "recover", "run", "summarize"]
@@ -175,13 +174,12 @@ def _identity(args: argparse.Namespace, files: Sequence[Path], cases: Sequence[C
 
     All of them count: each is the other scene of the next one's misalignments.
     """
-    names = "\n".join(str(path.resolve()) for path in files)
     return {
         "ball": args.ball,
         "exposure": args.exposure,
         "seed": args.seed,
         "cases": [" ".join(map(str, case.labels().values())) for case in cases],
-        "panoramas": hashlib.sha256(names.encode()).hexdigest()[:16],
+        "panoramas": fingerprint(*files),
     }
 
 
@@ -303,12 +301,4 @@ def _exposed(path: Path, exposure: str) -> Latlong:
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
     """Median and worst over the panoramas, a row for each case, in the order of the cases."""
-    names = ("misaligned", "evs", "merge", "unwrap")
-    summary = []
-    for labels in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
-        of_case = [row for row in rows if tuple(row[name] for name in names) == labels]
-        line: Row = {**dict(zip(names, labels, strict=True)), "panoramas": len(of_case)}
-        for key, ideal in IDEALS.items():
-            line |= median_and_worst(of_case, key, ideal=ideal)
-        summary.append(line)
-    return summary
+    return summarize_groups(rows, ("misaligned", "evs", "merge", "unwrap"), IDEALS)

@@ -6,7 +6,6 @@ The paper's ablation rows are variants of one run; its printed figures stand bel
 from __future__ import annotations
 
 import argparse
-import hashlib
 import sys
 import time
 from dataclasses import asdict
@@ -19,6 +18,7 @@ from ..estimate import Settings
 from ..imageio import read_envmap, read_exr_header
 from ..presets import Preset, preset
 from .cameras import CAMERAS
+from .journal import fingerprint
 from .painters import PAINTERS, open_studio
 from .paintings import VARIANTS, Painting, paint_maps, planned
 from .published import PUBLISHED
@@ -87,12 +87,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _identity(painter: str, files: ModelFiles) -> str:
-    """Name of a painter with a fingerprint of where its files lie: the folders themselves are nobody else's affair."""
+    """Name of a painter, with a fingerprint of its files if it has any."""
     places = (files.model, files.controlnet, files.lora, files.turbo_lora)
-    if not any(places):
-        return painter
-    text = "\n".join("" if place is None else str(place.resolve()) for place in places)
-    return f"{painter} {hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    return f"{painter} {fingerprint(*places)}" if any(places) else painter
 
 
 def _say(line: str) -> None:

@@ -12,7 +12,7 @@ import json
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -37,6 +37,7 @@ __all__ = [
     "panorama_files",
     "prepare_output",
     "publish",
+    "summarize_groups",
     "table",
 ]
 
@@ -141,6 +142,25 @@ def median_and_worst(rows: Sequence[Row], key: str, *, ideal: float = 0.0) -> Ro
     """
     values = [row[key] for row in rows]
     return {f"{key}_median": median(values), f"{key}_worst": max(values, key=lambda value: abs(value - ideal))}
+
+
+def summarize_groups(rows: Sequence[Row], names: Sequence[str], ideals: Mapping[str, float]) -> list[Row]:
+    """A record for each combination of labels, in the order of the rows: how many panoramas, and their figures.
+
+    Args:
+        rows: of panoramas and variants.
+        names: keys of the labels that tell variants apart.
+        ideals: keys of figures, and what each is without any error. A figure that no row of a variant knows is None.
+    """
+    summary = []
+    for labels in dict.fromkeys(tuple(row[name] for name in names) for row in rows):
+        of_case = [row for row in rows if tuple(row[name] for name in names) == labels]
+        line: Row = {**dict(zip(names, labels, strict=True)), "panoramas": len(of_case)}
+        for key, ideal in ideals.items():
+            known = [row for row in of_case if row[key] is not None]
+            line |= median_and_worst(known, key, ideal=ideal) if known else {key: None}
+        summary.append(line)
+    return summary
 
 
 def document(report: Report, args: argparse.Namespace) -> Row:
