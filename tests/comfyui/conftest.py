@@ -155,6 +155,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.fixture(autouse=True)
+def _no_gradients() -> Iterator[None]:
+    """Nodes run without gradients, as in ComfyUI."""
+    with torch.no_grad():
+        yield
+
+
+@pytest.fixture(autouse=True)
 def _no_finished_balls() -> None:
     """Every test starts with nothing painted, as after a start of ComfyUI."""
     if installed():

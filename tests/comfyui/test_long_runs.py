@@ -35,12 +35,6 @@ def graph(trained_graph: Any) -> Any:
     return trained_graph
 
 
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Any:
-    with torch.no_grad():
-        yield
-
-
 def run(node: Nodes, graph: Any, scene: Any, **changes: Any) -> Any:
     """Outputs of IterativeMedian: ball, median, spread, composite, report."""
     places = {"image": scene.canvas, "depth": scene.depth, "ball": scene.ball, "mask": scene.mask}

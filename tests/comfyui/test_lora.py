@@ -17,12 +17,6 @@ OUTPUTS = 2e-5
 """Outputs of order 1; a product added to a layer's output instead of its weight is the same sum in another order."""
 
 
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
-
-
 def lora_shapes(mini: Any) -> dict[str, tuple[int, ...]]:
     return pack_module("dl_core.backends.diffusers_lora").lora_shapes(mini.unet)
 

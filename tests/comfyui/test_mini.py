@@ -14,12 +14,6 @@ NETWORKS = 1e-4  # of order 0.3, several hundred operations deep
 PIXELS = 1e-5
 
 
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Any:
-    with torch.no_grad():
-        yield
-
-
 def step_inputs(generator: torch.Generator, size: int = 16) -> dict[str, torch.Tensor]:
     def draw(*shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=generator)

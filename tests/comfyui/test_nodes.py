@@ -27,12 +27,6 @@ ROUNDS = {"preset": "custom", "balls": 3, "rounds": 2, "strength": 1.0, "final":
 Nodes = Callable[[str], Any]
 
 
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Any:
-    with torch.no_grad():
-        yield
-
-
 def errors() -> Any:
     return pack_module("dl_core.errors")
 

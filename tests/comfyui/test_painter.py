@@ -13,12 +13,6 @@ from comfy_host import pack_module
 STEPS = 3
 
 
-@pytest.fixture(autouse=True)
-def _no_gradients() -> Any:
-    with torch.no_grad():
-        yield
-
-
 class Recorder:
     """An observer that adds up."""
 
