@@ -7,13 +7,28 @@ node pack's ComfyPainter, and the tests' AnalyticPainter, which draws true balls
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 from .ball import Ball
 from .errors import OptionError
 from .shapes import BallImage, Image
 
-__all__ = ["Observer", "PaintRequest", "PaintResult", "Painter", "SilentObserver", "first_step"]
+__all__ = [
+    "IMPUTINGS",
+    "Imputing",
+    "Observer",
+    "PaintRequest",
+    "PaintResult",
+    "Painter",
+    "SilentObserver",
+    "first_step",
+]
+
+Imputing = Literal["initial", "predicted"]
+"""Noise put on the photograph outside the mask at every step: `initial`, the noise the ball started from, as in the
+authors' code; `predicted`, what the denoiser just predicted, as the paper's Algorithm 0 writes it."""
+
+IMPUTINGS: Final[tuple[Imputing, ...]] = get_args(Imputing)
 
 
 @dataclass(frozen=True)

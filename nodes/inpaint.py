@@ -19,8 +19,9 @@ from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
 from ..dl_core.painter import PaintRequest
 from ..dl_core.presets import PRESETS
-from .painter import SAMPLERS, SCHEDULERS, ComfyPainter, Guidance, Networks
+from .painter import ComfyPainter, Guidance, Networks
 from .progress import BarObserver
+from .sampling import SAMPLERS, SCHEDULERS
 from .sockets import CATEGORY, BallSocket, DepthModelSocket, as_rgb, named_output
 
 __all__ = ["ChromeBallInpaint", "IterativeMedian"]

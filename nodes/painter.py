@@ -1,17 +1,14 @@
 """ComfyPainter: the Painter port on ComfyUI's own sampling.
 
-With nodes/from_diffusers.py and nodes/mini.py this is the only file that touches ComfyUI's internals:
-`comfy.sample.sample_custom`, `comfy.samplers` (sampler_object, KSAMPLER, KSampler's schedules),
-`comfy.model_management` (interruption, free memory),
-a model's `model_function_wrapper`, `model_sampling`, `model_config`, `memory_required`, `model_size`, `loaded_size` and
-`patches_uuid`, a ControlNet's `copy`, `set_cond_hint` and `get_models`, and a VAE's `encode`, `decode` and
-`first_stage_model`.
+With nodes/sampling.py, nodes/from_diffusers.py and nodes/mini.py this is the only file that touches ComfyUI's
+internals: `comfy.model_management` (interruption, free memory), a model's `model_function_wrapper`, `model_config`,
+`memory_required`, `model_size`, `loaded_size` and `patches_uuid`, a ControlNet's `copy`, `set_cond_hint` and
+`get_models`, and a VAE's `encode`, `decode` and `first_stage_model`.
 
 How it differs from the paper's Algorithm 0 in its authors' code. Outside the mask both hold the photograph's latent
-with the same initial noise at the level of every evaluation (there: put in after a step; here: before an evaluation,
-which is the same moment). At strength 1 the first evaluation sees noise alone, as there (`_FromNoise`). On cells the
-mask covers partly, here the estimate is blended with the clean latent too. The autoencoder's mode is encoded, not a
-sample.
+with the same noise at the level of every evaluation (there: put in after a step; here: before an evaluation, which is
+the same moment). At strength 1 the first evaluation sees noise alone, as there. On cells the mask covers partly, here
+the estimate is blended with the clean latent too. The autoencoder's mode is encoded, not a sample.
 """
 
 from __future__ import annotations
@@ -24,34 +21,17 @@ from typing import Any, Final
 import comfy.controlnet
 import comfy.model_base
 import comfy.model_management
-import comfy.sample
-import comfy.samplers
 import torch
 
 from ..dl_core.ball import Ball, crop_ball, disc_mask
 from ..dl_core.batches import Batches
 from ..dl_core.errors import ModelError, OptionError
 from ..dl_core.finished import FinishedBalls, content_key
-from ..dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+from ..dl_core.painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
 from ..dl_core.shapes import BallImage, Image, Mask
+from .sampling import LEADING, SAMPLERS, SCHEDULERS, STOCHASTIC, BallNoise, sample, sigmas_of
 
-__all__ = ["LEADING", "SAMPLERS", "SCHEDULERS", "ComfyPainter", "Guidance", "Networks", "leading_timesteps"]
-
-SAMPLERS: Final = tuple(
-    name
-    for name in ("uni_pc", "uni_pc_bh2", "euler", "dpmpp_2m", "deis", "ipndm", "ipndm_v", "lms", "res_multistep")
-    if name in comfy.samplers.KSampler.SAMPLERS
-)
-"""ComfyUI's samplers that evaluate the model once a step and draw no noise of their own.
-
-The others would break one of the method's rules: that a ball depends on its seed alone and not on who shares its
-batch, that exposures share their noise, and that the cost of a run is known before it starts. ComfyUI's `ddim` is
-`euler` with another noise around the mask.
-"""
-
-LEADING: Final = "leading (paper)"
-SCHEDULERS: Final = (LEADING, *(name for name in comfy.samplers.KSampler.SCHEDULERS if name != "ddim_uniform"))
-"""The paper's schedule, then ComfyUI's, except one that does not keep to the number of steps asked for."""
+__all__ = ["ComfyPainter", "Guidance", "Networks"]
 
 MOST_AT_ONCE: Final = 16
 """Balls of a batch that is chosen from free memory: beyond it a batch gains little, and an interrupt loses more."""
@@ -91,6 +71,7 @@ class Guidance:
         scheduler: of `SCHEDULERS`.
         control_strength: of the depth ControlNet; at 0 it is not evaluated.
         batch_size: balls painted at once; 0 is as many as memory allows (`_room`), up to `MOST_AT_ONCE`.
+        impute: noise put on what lies outside the mask, see `painter.Imputing`.
     """
 
     cfg: float = 5.0
@@ -98,29 +79,18 @@ class Guidance:
     scheduler: str = LEADING
     control_strength: float = 0.5
     batch_size: int = 0
+    impute: Imputing = "initial"
 
     def __post_init__(self) -> None:
-        for name, value, accepted in (("sampler", self.sampler, SAMPLERS), ("scheduler", self.scheduler, SCHEDULERS)):
+        tables = {"sampler": SAMPLERS, "scheduler": SCHEDULERS, "impute": IMPUTINGS}
+        for name, accepted in tables.items():
+            value = getattr(self, name)
             if value not in accepted:
                 raise OptionError(name, value, ", ".join(accepted))
         if not 1 <= self.cfg < math.inf:
             raise OptionError("cfg", self.cfg, "1 or more; at 1 the negative prompt is left out")
         if self.batch_size < 0:
             raise OptionError("batch_size", self.batch_size, "1 or more, or 0 to let free memory decide")
-
-
-def leading_timesteps(steps: int, trained: int = 1000) -> list[int]:
-    """Timesteps that UniPC visits with SDXL's scheduler settings (leading spacing, offset 1), first to last.
-
-    30 steps visit 961, 929 … 33.
-
-    Raises:
-        OptionError: fewer timesteps than steps.
-    """
-    stride = trained // (steps + 1)
-    if stride < 1:
-        raise OptionError("steps", steps, f"1 to {trained - 1}")
-    return [stride * (steps - i) + 1 for i in range(steps)]
 
 
 class ComfyPainter:
@@ -171,10 +141,15 @@ class ComfyPainter:
         """
         counter, notes = _Counter(observer), list[str]()
         mask = self._mask if self._mask is not None else disc_mask(request.ball, grow=request.ball.dilation)
-        sigmas = self._sigmas(request.steps)[first_step(request.steps, request.strength) :]
-        if len(sigmas) < 3 and self._guidance.sampler.startswith("uni_pc"):
-            raise OptionError(
-                "steps", request.steps, f"at least 2 steps to run with the sampler {self._guidance.sampler}"
+        sampler, scheduler = self._guidance.sampler, self._guidance.scheduler
+        every = sigmas_of(self._networks.model, sampler, scheduler, request.steps)
+        sigmas = every[first_step(request.steps, request.strength) :]
+        if len(sigmas) < 3 and sampler.startswith("uni_pc"):
+            raise OptionError("steps", request.steps, f"at least 2 steps to run with the sampler {sampler}")
+        if sampler in STOCHASTIC and request.strength == 1:  # once an exposure
+            notes.append(
+                f"{sampler} is stochastic: it draws new noise at every step, from each ball's seed, so balls repeat, "
+                "but the noise a ball starts from no longer decides it, as the paper assumes"
             )
         key = self._key(request, mask)
         balls = self._finished.find(key, request.seeds)
@@ -205,19 +180,22 @@ class ComfyPainter:
         latent = self._networks.vae.encode(request.canvas)
         positive, negative = self._controlled(request)
 
+        guidance = self._guidance
+        after_posterior = _draws_posterior(self._networks.vae)
+
         def paint(seeds: tuple[int, ...]) -> BallImage:
-            samples = comfy.sample.sample_custom(
+            samples = sample(
                 model,
-                _noise(seeds, latent, after_posterior=_draws_posterior(self._networks.vae)),
-                self._guidance.cfg,
-                _sampler(self._guidance.sampler, model, from_noise=request.strength == 1),
-                sigmas.clone(),  # uni_pc writes into it
-                positive,
-                negative,
-                latent.expand(len(seeds), -1, -1, -1),
-                noise_mask=mask,
-                disable_pbar=True,
-                seed=seeds[0],
+                BallNoise(seeds, latent, after_posterior=after_posterior),
+                latent,
+                mask,
+                sigmas,
+                sampler=guidance.sampler,
+                cfg=guidance.cfg,
+                positive=positive,
+                negative=negative,
+                impute=guidance.impute,
+                from_noise=request.strength == 1,
             )
             return _decode_ball(self._networks.vae, samples, request.ball)
 
@@ -248,19 +226,6 @@ class ComfyPainter:
         # The EV reaches the ball through its conditioning alone.
         asked = replace(request, seeds=(0,), ev=0.0)
         return content_key(networks, str(patches), guidance, mask, asked)
-
-    def _sigmas(self, steps: int) -> torch.Tensor:
-        """Noise levels of a full schedule, (steps + 1,), the last one 0."""
-        guidance, sampling = self._guidance, self._networks.model.get_model_object("model_sampling")
-        if guidance.scheduler == LEADING:
-            levels = sampling.sigma(torch.tensor(leading_timesteps(steps), dtype=torch.float32))
-            return torch.cat((levels.float().cpu(), torch.zeros(1)))
-        schedule = comfy.samplers.KSampler(
-            self._networks.model, steps, "cpu", guidance.sampler, guidance.scheduler, denoise=1.0
-        )
-        if len(schedule.sigmas) != steps + 1:
-            raise OptionError("scheduler", guidance.scheduler, f"a schedule that can be cut into {steps} steps")
-        return schedule.sigmas.float()
 
     def _controlled(self, request: PaintRequest) -> tuple[Any, Any]:
         """Both conditionings with SDXL's picture sizes (their own win) and the depth control (after any they have)."""
@@ -319,64 +284,9 @@ def _watched(model: Any, counter: _Counter) -> Any:
     return watched
 
 
-def _noise(seeds: tuple[int, ...], latent: torch.Tensor, *, after_posterior: bool) -> torch.Tensor:
-    """Noise of each ball from its own seed, drawn on the CPU: a ball does not depend on its batch or device.
-
-    Args:
-        seeds: of the balls.
-        latent: (1, ...) of the canvas.
-        after_posterior: whether a sample of the autoencoder's posterior is drawn first, as diffusers and the authors'
-            code do, so that a seed means the same noise here. ComfyUI takes the mode, and the draw itself is dropped.
-    """
-    return torch.cat([_draw(seed, (1, *latent.shape[1:]), after_posterior) for seed in seeds])
-
-
-def _draw(seed: int, shape: tuple[int, ...], after_posterior: bool) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    if after_posterior:
-        torch.randn(shape, generator=generator)
-    return torch.randn(shape, generator=generator)
-
-
 def _draws_posterior(vae: Any) -> bool:
     """Whether a VAE encodes to a distribution, as SDXL's does, and not to latents, as TAESD does."""
     return hasattr(vae.first_stage_model, "regularization")
-
-
-def _sampler(name: str, model: Any, *, from_noise: bool) -> Any:
-    """ComfyUI's sampler of a name; with `from_noise` it starts from noise alone (see `_FromNoise`)."""
-    sampler = comfy.samplers.sampler_object(name)
-    if not from_noise:
-        return sampler
-    sampling = model.get_model_object("model_sampling")
-
-    def start_from_noise(inpaint: Any, x: torch.Tensor, sigmas: torch.Tensor, **options: Any) -> torch.Tensor:
-        noise = sampling.noise_scaling(sigmas[0], inpaint.noise, torch.zeros_like(x), True)
-        return sampler.sampler_function(_FromNoise(inpaint, noise / sigmas[0]), noise, sigmas, **options)
-
-    return comfy.samplers.KSAMPLER(start_from_noise, sampler.extra_options, sampler.inpaint_options)
-
-
-class _FromNoise:
-    """ComfyUI's inpainting denoiser, seeing noise alone at its first evaluation.
-
-    ComfyUI adds noise to the photograph's latent around the mask from the first evaluation on; the authors' code
-    starts from noise everywhere and puts the photograph in after the first step.
-    """
-
-    def __init__(self, inpaint: Any, start: torch.Tensor) -> None:
-        """Put a start in the place of the photograph, in units of the first noise level."""
-        self._inpaint, self._known = inpaint, (inpaint.latent_image, inpaint.noise)
-        inpaint.latent_image, inpaint.noise = torch.zeros_like(inpaint.latent_image), start
-
-    def __call__(self, *arguments: Any, **options: Any) -> torch.Tensor:
-        try:
-            return self._inpaint(*arguments, **options)  # type: ignore[no-any-return]
-        finally:
-            self._inpaint.latent_image, self._inpaint.noise = self._known
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._inpaint, name)
 
 
 def _decode_ball(vae: Any, samples: torch.Tensor, ball: Ball) -> BallImage:

@@ -204,6 +204,6 @@ def leading_euler(config: Any) -> Any:
 
     class LeadingEuler(EulerDiscreteScheduler):
         def set_timesteps(self, num_inference_steps: int, device: Any = None) -> None:
-            super().set_timesteps(timesteps=pack_module("nodes.painter").leading_timesteps(num_inference_steps))
+            super().set_timesteps(timesteps=pack_module("nodes.sampling").leading_timesteps(num_inference_steps))
 
     return LeadingEuler.from_config(config)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import torch
 import torch.nn.functional as F
@@ -29,12 +29,12 @@ from ..ball import Ball, crop_ball, disc_mask, require_canvas
 from ..batches import Batches, is_out_of_memory
 from ..errors import ModelError, OptionError
 from ..lora import EXPOSURE_SCALE, LoraSwap
-from ..painter import Observer, PaintRequest, PaintResult, first_step
+from ..painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
 from ..shapes import BallImage, Image
 from .diffusers_lora import EXPOSURE, TURBO, add_lora
 from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults, read_weights
 
-__all__ = ["SAMPLERS", "DiffusersPainter", "Guidance", "Imputing", "ball_latent_mask"]
+__all__ = ["SAMPLERS", "DiffusersPainter", "Guidance", "ball_latent_mask"]
 
 SAMPLERS: Final[dict[str, Callable[..., Any]]] = {
     "unipc": lambda config: UniPCMultistepScheduler.from_config(config),
@@ -42,8 +42,6 @@ SAMPLERS: Final[dict[str, Callable[..., Any]]] = {
     "euler": lambda config: EulerDiscreteScheduler.from_config(config),
 }
 """Deterministic samplers by name, the paper's first. A stochastic one would break the bond of seed and ball."""
-
-Imputing = Literal["initial", "predicted"]
 
 PAPER_DEFAULTS: Final = ModelDefaults(
     canvas=1024, diameter=256, guidance=5.0, control_scale=0.5, lora_scale=EXPOSURE_SCALE, ev_min=-5.0
@@ -82,7 +80,7 @@ class DiffusersPainter:
         defaults: prompts, guidance, scale of ControlNet and LoRA, and the EV of the dark prompt.
         sampler: a name of `SAMPLERS`.
         batch: balls denoised at once; less memory with less. Where a batch does not fit, it is halved from there on.
-        impute: noise put on what lies outside the mask (see the module).
+        impute: noise put on what lies outside the mask, see `painter.Imputing`.
         lora_swap: when the pipeline's adapters `diffusers_lora.TURBO` and `EXPOSURE` act, in every pass; without it
             the pipeline's adapters stay as they are.
     """
@@ -101,8 +99,8 @@ class DiffusersPainter:
             raise OptionError("sampler", sampler, ", ".join(SAMPLERS))
         if batch < 1:
             raise OptionError("batch", batch, "1 or more")
-        if impute not in ("initial", "predicted"):
-            raise OptionError("impute", impute, "initial, predicted")
+        if impute not in IMPUTINGS:
+            raise OptionError("impute", impute, ", ".join(IMPUTINGS))
         if impute == "predicted" and sampler == "euler":
             raise OptionError("impute", impute, "initial, with the euler sampler")
         self.pipeline = pipeline

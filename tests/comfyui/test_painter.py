@@ -41,12 +41,17 @@ def paint(graph: Any, asked: Any, **options: Any) -> Any:
     return painter(graph, **options).paint(asked, Recorder())
 
 
+STOCHASTIC = ("lcm", "euler_ancestral", "dpmpp_2m_sde", "ddpm")
+
+
 def samplers() -> tuple[str, ...]:
-    return ("uni_pc", "uni_pc_bh2", "euler", "dpmpp_2m", "deis", "ipndm", "ipndm_v", "lms", "res_multistep")
+    plain = ("uni_pc", "uni_pc_bh2", "euler", "dpmpp_2m", "deis", "ipndm", "ipndm_v", "lms", "res_multistep")
+    return plain + STOCHASTIC
 
 
 def test_list_of_samplers_is_the_one_tested(pack: Any) -> None:
-    assert samplers() == pack_module("nodes.painter").SAMPLERS
+    module = pack_module("nodes.sampling")
+    assert (samplers(), STOCHASTIC) == (module.SAMPLERS, module.STOCHASTIC)
 
 
 @pytest.mark.parametrize("sampler", samplers())
@@ -81,6 +86,26 @@ def test_a_ball_depends_on_its_seed_and_not_on_its_batch(graph: Any, scene: Any,
     assert (together[0] - together[1]).abs().max() > 1e-4
 
 
+@pytest.mark.parametrize("sampler", samplers())
+def test_stochastic_samplers_repeat_and_say_so(graph: Any, scene: Any, sampler: str) -> None:
+    first, again = (paint(graph, request(scene, (7,)), sampler=sampler) for _ in range(2))
+    assert torch.equal(first.balls, again.balls)
+    assert any("is stochastic" in note for note in first.notes) == (sampler in STOCHASTIC)
+    assert paint(graph, request(scene, (7,), strength=0.7), sampler=sampler).notes == ()
+
+
+@pytest.mark.parametrize("after_posterior", [False, True])
+def test_noise_of_a_ball_is_its_own_generators(pack: Any, after_posterior: bool) -> None:
+    latent = torch.zeros(1, 4, 2, 3)
+    noise = pack_module("nodes.sampling").BallNoise((5, 9), latent, after_posterior=after_posterior)
+    drawn = [noise.initial, noise(torch.tensor(3.0), torch.tensor(2.0)), noise(torch.tensor(2.0), torch.tensor(1.0))]
+    for row, seed in enumerate((5, 9)):
+        generator = torch.Generator().manual_seed(seed)
+        stream = [torch.randn(1, 4, 2, 3, generator=generator) for _ in range(3 + after_posterior)]
+        for ours, expected in zip(drawn, stream[after_posterior:], strict=True):
+            assert torch.equal(ours[row], expected[0])
+
+
 def test_strength_one_starts_from_noise_alone(graph: Any, scene: Any) -> None:
     """Under the disc the photograph must not show through: two photographs that differ there only give one ball."""
     other = scene.canvas.clone()
@@ -109,7 +134,7 @@ def test_paper_schedule_visits_what_diffusers_visits(graph: Any, scene: Any, ste
         beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", timestep_spacing="leading", steps_offset=1
     )
     reference.set_timesteps(steps)
-    visited = pack_module("nodes.painter").leading_timesteps(steps)
+    visited = pack_module("nodes.sampling").leading_timesteps(steps)
     assert visited == reference.timesteps.tolist()
     if steps == 30:
         assert visited[:2] + visited[-1:] == [961, 929, 33]
@@ -200,6 +225,31 @@ def leading_euler(monkeypatch: pytest.MonkeyPatch) -> str:
     table = pack_module("dl_core.backends.diffusers_painter").SAMPLERS
     monkeypatch.setitem(table, "leading_euler", comfy_host.leading_euler)
     return "leading_euler"
+
+
+@pytest.mark.parametrize(("steps", "strength"), [(6, 1.0), (10, 0.8)])
+def test_predicted_noise_is_imputed_as_in_the_listing(
+    trained_graph: Any, mini_scene: Any, monkeypatch: pytest.MonkeyPatch, steps: int, strength: float
+) -> None:
+    """Euler over noise levels is DDIM, which is first-order DPM-Solver++ in diffusers, on UniPC's timesteps."""
+    from diffusers import DPMSolverMultistepScheduler
+
+    backend = pack_module("dl_core.backends.diffusers_painter")
+
+    def first_order(config: Any) -> Any:
+        return DPMSolverMultistepScheduler.from_config(config, solver_order=1, algorithm_type="dpmsolver++")
+
+    monkeypatch.setitem(backend.SAMPLERS, "first_order", first_order)
+    defaults = replace(trained_graph.mini.defaults, guidance=3.0, control_scale=0.5)
+    mini = replace(trained_graph.mini, defaults=defaults, lora=None)
+    asked = request(mini_scene, (0, 1), strength, steps)
+    theirs, other = (
+        backend.DiffusersPainter.from_mini(mini, sampler="first_order", impute=impute).paint(asked, Recorder()).balls
+        for impute in ("predicted", "initial")
+    )
+    ours = paint(trained_graph, asked, sampler="euler", cfg=3.0, control_strength=0.5, impute="predicted").balls
+    assert (ours - theirs).abs().mean() < 5e-3  # cells that the mask covers partly are blended differently
+    assert (other - theirs).abs().mean() > 0.01  # so the option does something, in both
 
 
 def euler_difference(graph: Any, scene: Any, steps: int, strength: float, row: str) -> tuple[float, float]:
