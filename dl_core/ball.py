@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from .errors import ImageError, OptionError
 from .shapes import BallImage, Image, Mask
 
 __all__ = [
+    "DEPTH_DISCS",
     "Ball",
     "Frame",
     "crop_ball",
@@ -37,6 +39,12 @@ __all__ = [
 ]
 
 
+DEPTH_DISCS: Final[dict[str, float]] = {"ball": 0.0, "authors": 0.5}
+"""How far the disc on the depth map departs from the ball, pixels: its radius grows and its centre moves right and down
+by as much. `ball` is the ball itself; the authors' code draws a disc of 257 pixels for a ball of 256, with one row and
+one column more at the right and below."""
+
+
 @dataclass(frozen=True)
 class Ball:
     """A ball of whole-pixel size on a canvas.
@@ -47,6 +55,7 @@ class Ball:
         diameter: side of that square, pixels.
         canvas: side of the square canvas, pixels.
         dilation: how far the inpaint disc reaches past the ball on each side, pixels (paper's code: 10 of 1024).
+        depth_disc: of `DEPTH_DISCS`, what the depth map shows of the ball.
     """
 
     left: int
@@ -54,6 +63,7 @@ class Ball:
     diameter: int
     canvas: int
     dilation: int
+    depth_disc: str = "ball"
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -62,7 +72,13 @@ class Ball:
 
 
 def place_ball(
-    canvas: int, diameter: int, *, x: float | None = None, y: float | None = None, dilation: int | None = None
+    canvas: int,
+    diameter: int,
+    *,
+    x: float | None = None,
+    y: float | None = None,
+    dilation: int | None = None,
+    depth_disc: str = "ball",
 ) -> Ball:
     """Place a ball on a square canvas.
 
@@ -72,9 +88,10 @@ def place_ball(
         x: column of the centre in canvas coordinates; the middle when not given. Rounded to a whole-pixel square.
         y: row of the centre; the middle when not given.
         dilation: pixels the inpaint disc reaches past the ball; the paper's 10 per 1024 pixels when not given.
+        depth_disc: of `DEPTH_DISCS`, what the depth map shows of the ball.
 
     Raises:
-        OptionError: the canvas is not a multiple of 8, or the ball does not fit on it.
+        OptionError: the canvas is not a multiple of 8, the ball does not fit on it, or no such disc.
     """
     if canvas < 64 or canvas % 8:
         raise OptionError("canvas", canvas, "a multiple of 8, at least 64 pixels")
@@ -86,7 +103,9 @@ def place_ball(
         dilation = max(1, round(canvas * 10 / 1024))
     if not 0 <= dilation <= canvas // 2:
         raise OptionError("dilation", dilation, f"0 to {canvas // 2} pixels")
-    return Ball(left, top, diameter, canvas, dilation)
+    if depth_disc not in DEPTH_DISCS:
+        raise OptionError("depth_disc", depth_disc, ", ".join(DEPTH_DISCS))
+    return Ball(left, top, diameter, canvas, dilation, depth_disc)
 
 
 def _first_pixel(name: str, centre: float | None, canvas: int, diameter: int) -> int:
@@ -183,14 +202,19 @@ def _lanczos(image: Image, height: int, width: int) -> Float[Tensor, "b rows col
     return torch.from_numpy(np.array(resized)).permute(0, 2, 3, 1)
 
 
-def disc_mask(ball: Ball, *, grow: float = 0.0) -> Mask:
+def disc_mask(ball: Ball, *, grow: float = 0.0, shift: float = 0.0) -> Mask:
     """Hard disc on the canvas: 1 where a pixel's centre lies within the ball's radius plus `grow` pixels.
+
+    Args:
+        ball: where it sits.
+        grow: pixels added to its radius.
+        shift: pixels that the disc's centre lies right of and below the ball's.
 
     Returns:
         (1, canvas, canvas).
     """
     x, y = ball.centre
-    positions = torch.arange(ball.canvas) + 0.5
+    positions = torch.arange(ball.canvas) + 0.5 - shift
     squared = (positions[None, :] - x) ** 2 + (positions[:, None] - y) ** 2
     return (squared <= (ball.diameter / 2 + grow) ** 2).float()[None]
 
@@ -201,7 +225,7 @@ def paint_depth(depth: Image | None, ball: Ball) -> Float[Tensor, "b side side 3
     Args:
         depth: (B, H, W, 1 or 3), near is bright; it is fitted to the canvas and stretched to [0, 1] as the authors'
             code does. Without one the scene is taken as far away (black).
-        ball: where the ball goes.
+        ball: where the ball goes, and which disc stands for it.
 
     Returns:
         (B, canvas, canvas, 3) in [0, 1].
@@ -217,7 +241,8 @@ def paint_depth(depth: Image | None, ball: Ball) -> Float[Tensor, "b side side 3
         plane = depth.float().mean(dim=-1, keepdim=True)
         low, high = plane.amin(dim=(1, 2, 3), keepdim=True), plane.amax(dim=(1, 2, 3), keepdim=True)
         fitted = fit_canvas((plane - low) / (high - low).clamp(min=1e-8), ball.canvas)
-    disc = disc_mask(ball)[..., None].to(fitted)
+    departs = DEPTH_DISCS[ball.depth_disc]
+    disc = disc_mask(ball, grow=departs, shift=departs)[..., None].to(fitted)
     return (fitted * (1 - disc) + disc).expand(-1, -1, -1, 3).contiguous()
 
 

@@ -38,6 +38,7 @@ class Settings:
         x: column of the ball's centre on the canvas; the middle when None.
         y: row of the ball's centre; the middle when None.
         height: rows of the latlong map.
+        depth_disc: of `ball.DEPTH_DISCS`, what the depth map shows of the ball.
     """
 
     rounds: Rounds = field(default_factory=Rounds)
@@ -49,6 +50,7 @@ class Settings:
     x: float | None = None
     y: float | None = None
     height: int = 256
+    depth_disc: str = "ball"
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def estimate(
     check_merge(settings.merge)
     if settings.height < 2:
         raise OptionError("height", settings.height, "2 or more rows")
-    ball = place_ball(settings.canvas, settings.diameter, x=settings.x, y=settings.y)
+    ball = place_ball(settings.canvas, settings.diameter, x=settings.x, y=settings.y, depth_disc=settings.depth_disc)
     canvas = fit_canvas(photo_ldr, settings.canvas)
     if depth is None and depth_of is not None:
         depth = depth_of(canvas)

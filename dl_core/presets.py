@@ -19,11 +19,13 @@ class Preset:
         rounds: schedule of iterative inpainting at each EV.
         evs: exposure values, descending from 0.
         summary: one line for people.
+        depth_disc: of `ball.DEPTH_DISCS`; the authors' where a preset reproduces their runs.
     """
 
     rounds: Rounds
     evs: tuple[float, ...]
     summary: str
+    depth_disc: str = "ball"
 
     @property
     def guided_steps(self) -> int:
@@ -40,9 +42,17 @@ PRESETS: Final[dict[str, Preset]] = {
     "draft": Preset(Rounds(balls=3, rounds=1, strength=0.8, steps=6, final=False), PAPER_EVS, "a first look"),
     "balanced": Preset(Rounds(balls=5, rounds=1, strength=0.8, steps=20), PAPER_EVS, "a usable estimate"),
     "turbo": Preset(
-        Rounds(balls=1, rounds=0, steps=30, final=False), PAPER_EVS, "one pass an exposure, for the Turbo LoRA"
+        Rounds(balls=1, rounds=0, steps=30, final=False),
+        PAPER_EVS,
+        "one pass an exposure, for the Turbo LoRA",
+        depth_disc="authors",
     ),
-    "paper": Preset(Rounds(balls=30, rounds=2, strength=0.8, steps=30), PAPER_EVS, "the paper's schedule, 4,932 steps"),
+    "paper": Preset(
+        Rounds(balls=30, rounds=2, strength=0.8, steps=30),
+        PAPER_EVS,
+        "the paper's schedule, 4,932 steps",
+        depth_disc="authors",
+    ),
 }
 
 

@@ -6,6 +6,7 @@ import torch
 from comfy_api.latest import io
 
 from ..dl_core.ball import (
+    DEPTH_DISCS,
     Ball,
     disc_mask,
     fit_canvas,
@@ -82,6 +83,14 @@ class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
                     tooltip="Pixels that the inpainted disc reaches past the ball on each side; -1 is the paper's 10 "
                     "per 1024 pixels of canvas.",
                 ),
+                io.Combo.Input(
+                    "depth_disc",
+                    options=list(DEPTH_DISCS),
+                    default="ball",
+                    optional=True,
+                    tooltip="What the depth map shows of the ball. ball: the ball itself. authors: a disc of one pixel "
+                    "more to the right and below, as the paper's code draws it.",
+                ),
             ],
             outputs=[
                 named_output(io.Image, "canvas_image", "The photograph on its canvas."),
@@ -101,10 +110,11 @@ class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
         y: int,
         dilation: int,
         depth: torch.Tensor | None = None,
+        depth_disc: str = "ball",
     ) -> io.NodeOutput:
         """Fit, place, paint."""
         photo = check_photograph(as_rgb(image, "image"))
-        ball = place_ball(canvas, diameter, x=_given(x), y=_given(y), dilation=_given(dilation))
+        ball = place_ball(canvas, diameter, x=_given(x), y=_given(y), dilation=_given(dilation), depth_disc=depth_disc)
         mask = disc_mask(ball, grow=ball.dilation)
         return io.NodeOutput(fit_canvas(photo, canvas), paint_depth(depth, ball), mask, ball)
 

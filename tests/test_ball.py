@@ -131,6 +131,21 @@ def test_depth_paints_the_ball_nearest() -> None:
     assert_close(control[..., 0], control[..., 2])
 
 
+def test_the_authors_depth_disc_is_a_pixel_wider_to_the_right_and_below() -> None:
+    """Their code: 257 pixels across around pixel 512 for the ball of 256 that begins at pixel 384."""
+    ball = place_ball(1024, 256, depth_disc="authors")
+    disc = paint_depth(None, ball)[0, :, :, 0] == 1
+    for lines in (disc.any(dim=0), disc.any(dim=1)):
+        assert lines.nonzero().flatten().tolist() == list(range(384, 641))
+    assert torch.equal(disc[384:641, 384:641], disc[384:641, 384:641].flip(0, 1))
+    assert int(disc.sum()) > int(disc_mask(ball).sum())
+
+
+def test_unknown_depth_disc_is_refused() -> None:
+    with pytest.raises(OptionError, match="depth_disc is 'mine'; accepted: ball, authors"):
+        place_ball(64, 16, depth_disc="mine")
+
+
 def test_without_depth_the_scene_is_far() -> None:
     ball = place_ball(64, 16)
     assert_close(paint_depth(None, ball)[..., 0], disc_mask(ball))

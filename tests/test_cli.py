@@ -70,7 +70,7 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Adds a row `true` to the table of backends: a painter without error on a 256 pixel canvas."""
 
     def add(painter: Painter | None = None, load_error: BaseException | None = None) -> None:
-        def load(args: object) -> LoadedPainter:
+        def load(files: object, impute: str) -> LoadedPainter:
             if load_error is not None:
                 raise load_error
             return LoadedPainter(painter or AnalyticPainter(sun_and_sky()), 256, 128)
@@ -202,6 +202,40 @@ def test_what_the_painter_notes_is_reported_by_exposure(
     assert json.loads(capsys.readouterr().out)["notes"] == ["EV 0: out of memory with 4 balls at once: went on with 2"]
 
 
+@pytest.mark.parametrize(
+    ("options", "disc"),
+    [
+        ((), "ball"),
+        (("--preset", "paper"), "authors"),
+        (("--preset", "turbo"), "authors"),
+        (("--preset", "paper", "--depth-disc", "ball"), "ball"),
+    ],
+)
+def test_the_authors_presets_use_their_depth_disc(
+    backend: Callable[..., None], photo: Path, out: Path, options: tuple[str, ...], disc: str
+) -> None:
+    seen = set()
+
+    class Watching(AnalyticPainter):
+        def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+            seen.add(request.ball.depth_disc)
+            return super().paint(replace(request, seeds=request.seeds[:1]), observer)
+
+    backend(Watching(sun_and_sky()))
+    assert run(photo, out, *options) == 0
+    assert seen == {disc}
+
+
+def test_turbo_without_its_lora_is_remarked(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend()
+    assert run(photo, out, "--preset", "turbo") == 0
+    assert "without a Turbo LoRA (--turbo-lora)" in capsys.readouterr().out
+    assert run(photo, out, "--preset", "turbo", "--turbo-lora", "turbo.safetensors") == 0
+    assert "without a Turbo LoRA" not in capsys.readouterr().out
+
+
 def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     backend()
     assert run(photo, out, "--json") == 0
@@ -229,6 +263,8 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
         (["--diameter", "300"], "diameter is 300; accepted: 16 to 256"),
         (["--x", "10"], "x is 10.0; accepted: 64 to 192"),
         (["--seed", "one"], "--seed"),
+        (["--impute", "none"], "impute is 'none'; accepted: initial, predicted"),
+        (["--depth-disc", "wide"], "depth_disc is 'wide'; accepted: ball, authors"),
         (["-o", "a.png"], "output is 'a.png'; accepted: a name that ends in .exr or .hdr"),
         (["--backend", "diffusers"], "model is None; accepted: a local file"),
         (["--backend", "mini", "--turbo-lora", "x"], "turbo_lora is 'x'; accepted: nothing with the backend mini"),

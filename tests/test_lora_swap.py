@@ -150,8 +150,8 @@ def test_both_loras_load_from_files(
     model: MiniModel, loras: dict[str, dict[str, Tensor]], request_: PaintRequest, folder: Path
 ) -> None:
     files = ModelFiles(folder / "sdxl", folder / "depth", folder / f"{EXPOSURE}.safetensors")
-    defaults = BACKENDS["diffusers"].load(files).painter.defaults  # type: ignore[attr-defined]
-    swapped = BACKENDS["diffusers"].load(replace(files, turbo_lora=folder / f"{TURBO}.safetensors")).painter
+    defaults = BACKENDS["diffusers"].load(files, "initial").painter.defaults  # type: ignore[attr-defined]
+    swapped = BACKENDS["diffusers"].load(replace(files, turbo_lora=folder / f"{TURBO}.safetensors"), "initial").painter
     assert isinstance(swapped, DiffusersPainter)
     assert swapped.lora_swap == LoraSwap(800, 1.0, 0.75)
     expected = painter_with(replace(model, defaults=defaults), loras, LoraSwap()).paint(request_, SilentObserver())

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from ..errors import OptionError
-from ..painter import Painter
+from ..painter import Imputing, Painter
 
 __all__ = ["BACKENDS", "Backend", "LoadedPainter", "ModelFiles", "choose_backend"]
 
@@ -64,12 +64,12 @@ class Backend:
 
     Attributes:
         summary: one line for people.
-        load: a painter from files. Raises OptionError for files it needs or has no use for, ModelError for files
-            that do not serve.
+        load: a painter from files, and the noise it puts on what lies outside the mask. Raises OptionError for files
+            it needs or has no use for, ModelError for files that do not serve.
     """
 
     summary: str
-    load: Callable[[ModelFiles], LoadedPainter]
+    load: Callable[[ModelFiles, Imputing], LoadedPainter]
 
 
 def _quiet_libraries() -> None:
@@ -81,7 +81,7 @@ def _quiet_libraries() -> None:
     transformers_logging.set_verbosity_error()
 
 
-def _load_mini(files: ModelFiles) -> LoadedPainter:
+def _load_mini(files: ModelFiles, impute: Imputing) -> LoadedPainter:
     for name in ("controlnet", "lora", "turbo_lora"):
         if getattr(files, name) is not None:
             value = str(getattr(files, name))
@@ -93,10 +93,12 @@ def _load_mini(files: ModelFiles) -> LoadedPainter:
     model = load_mini(MINI_FOLDER if files.model is None else files.model)
     if not files.exposure_lora:
         model = replace(model, lora=None)
-    return LoadedPainter(DiffusersPainter.from_mini(model), model.defaults.canvas, model.defaults.diameter)
+    return LoadedPainter(
+        DiffusersPainter.from_mini(model, impute=impute), model.defaults.canvas, model.defaults.diameter
+    )
 
 
-def _load_diffusers(files: ModelFiles) -> LoadedPainter:
+def _load_diffusers(files: ModelFiles, impute: Imputing) -> LoadedPainter:
     if files.model is None or files.controlnet is None:
         name = "model" if files.model is None else "controlnet"
         raise OptionError(name, None, "a local file or folder; the backend diffusers downloads nothing")
@@ -104,7 +106,7 @@ def _load_diffusers(files: ModelFiles) -> LoadedPainter:
     from .diffusers_painter import DiffusersPainter
 
     lora, turbo_lora = (files.lora, files.turbo_lora) if files.exposure_lora else (None, None)
-    painter = DiffusersPainter.from_files(files.model, files.controlnet, lora, turbo_lora)
+    painter = DiffusersPainter.from_files(files.model, files.controlnet, lora, turbo_lora, impute=impute)
     return LoadedPainter(painter, painter.defaults.canvas, painter.defaults.diameter)
 
 

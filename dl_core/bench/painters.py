@@ -40,7 +40,7 @@ def _backend(name: str) -> Callable[[ModelFiles], Studio]:
     def open_backend(files: ModelFiles) -> Studio:
         @cache  # a model is loaded once with its LoRA and once without, each when first wanted
         def load(exposure_lora: bool) -> LoadedPainter:
-            return BACKENDS[name].load(replace(files, exposure_lora=exposure_lora))
+            return BACKENDS[name].load(replace(files, exposure_lora=exposure_lora), "initial")
 
         def painter_of(variant: Variant, shot: Shot) -> Painter:
             return load(variant.lora).painter

@@ -31,6 +31,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--x", type=float, help="column of the ball's centre on the canvas (default: the middle)")
     add("--y", type=float, help="row of the ball's centre on the canvas (default: the middle)")
     add(
+        "--depth-disc",
+        metavar="NAME",
+        help="what the depth map shows of the ball: ball, or authors, their code's one pixel more (default: the "
+        "preset's, authors with paper and turbo)",
+    )
+    add(
+        "--impute",
+        default="initial",
+        help="noise put on the photograph outside the ball: initial, as the authors' code, or predicted, as the "
+        "paper's Algorithm 0 (default: initial)",
+    )
+    add(
         "--backend", default="mini", help="mini: the model that comes along, a preview; diffusers: SDXL (default: mini)"
     )
     add("--model", metavar="PATH", help="diffusers: SDXL checkpoint; mini: another folder than its own")

@@ -16,12 +16,13 @@ from tqdm import tqdm
 
 from .. import __version__
 from ..backends.loading import ModelFiles, choose_backend
+from ..ball import DEPTH_DISCS
 from ..depth import load_depth_model
 from ..errors import OptionError
 from ..estimate import Probe, Settings, estimate, planned_evaluations
 from ..exposure import check_evs, check_merge
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
-from ..painter import Painter, SilentObserver
+from ..painter import IMPUTINGS, Painter, SilentObserver
 from ..presets import preset
 from ..shapes import Image
 from ..spheres import sphere_sheet
@@ -80,6 +81,10 @@ def run(args: argparse.Namespace) -> None:
     evs = chosen.evs if args.evs is None else _parse_evs(args.evs)
     backend = choose_backend(args.backend)
     check_merge(args.merge)
+    if args.impute not in IMPUTINGS:
+        raise OptionError("impute", args.impute, ", ".join(IMPUTINGS))
+    if args.depth_disc is not None and args.depth_disc not in DEPTH_DISCS:
+        raise OptionError("depth_disc", args.depth_disc, ", ".join(DEPTH_DISCS))
     if not 0 <= args.seed < 2**32:
         raise OptionError("seed", args.seed, "0 to 4294967295")
     if not 2 <= args.height <= 4096:
@@ -87,7 +92,7 @@ def run(args: argparse.Namespace) -> None:
     outputs.require_writable([Path(name) for name in (args.photo, args.depth) if name is not None])
     photo = read_photograph(args.photo)
     depth, depth_of = _depth(args.depth)
-    loaded = backend.load(ModelFiles.of(args))
+    loaded = backend.load(ModelFiles.of(args), args.impute)
     settings = Settings(
         rounds=chosen.rounds,
         evs=evs,
@@ -98,6 +103,7 @@ def run(args: argparse.Namespace) -> None:
         x=args.x,
         y=args.y,
         height=args.height,
+        depth_disc=chosen.depth_disc if args.depth_disc is None else args.depth_disc,
     )
     painting = time.perf_counter()
     probe = _paint(photo, loaded.painter, settings, depth, depth_of)
@@ -163,9 +169,12 @@ def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]
 def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds: dict[str, float]) -> None:
     memory = _peak_memory()
     notes = [
-        f"EV {ev:g}: {note}"
-        for ev, exposure in zip(probe.settings.evs, probe.exposures, strict=True)
-        for note in exposure.notes
+        *_doubts(args),
+        *(
+            f"EV {ev:g}: {note}"
+            for ev, exposure in zip(probe.settings.evs, probe.exposures, strict=True)
+            for note in exposure.notes
+        ),
     ]
     if args.json:
         report = {
@@ -190,6 +199,15 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
     peak = "" if memory is None else f", {memory / 2**30:.2f} GiB at the peak"
     took = f"{seconds['painting']:.1f} s, {seconds['total']:.1f} s in all"
     print(f"{probe.evaluations} denoiser evaluations in {took}{peak}")
+
+
+def _doubts(args: argparse.Namespace) -> list[str]:
+    """Choices that run, but hardly give what was wanted."""
+    if args.preset == "turbo" and args.turbo_lora is None:
+        return [
+            "preset turbo without a Turbo LoRA (--turbo-lora): each exposure is one ball of one pass, taken as it is"
+        ]
+    return []
 
 
 def _peak_memory() -> int | None:
