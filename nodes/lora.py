@@ -12,7 +12,6 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 import comfy.lora
-import comfy.model_base
 import comfy.utils
 import folder_paths
 import torch
@@ -20,8 +19,8 @@ import torch.nn.functional as F
 from comfy.patcher_extension import CallbacksMP, WrappersMP
 from torch import Tensor
 
-from ..dl_core.errors import ModelError
 from ..dl_core.lora import LoraSwap, LowRank, read_lora
+from .architecture import require_sdxl
 
 __all__ = ["read_lora_file", "with_lora", "with_lora_swap"]
 
@@ -42,9 +41,7 @@ def _layers(model: Any) -> dict[str, str]:
     Raises:
         ModelError: a model whose layers have no such names.
     """
-    inner = getattr(model, "model", None)
-    if not isinstance(inner, comfy.model_base.SDXL):
-        raise ModelError("socket model", f"holds {type(inner).__name__}; a model of SDXL's architecture is accepted")
+    inner = require_sdxl(model)
     present = inner.diffusion_model.state_dict().keys()
     names = comfy.utils.unet_to_diffusers(inner.model_config.unet_config)
     return {

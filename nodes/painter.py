@@ -18,17 +18,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
-import comfy.controlnet
-import comfy.model_base
 import comfy.model_management
 import torch
 
 from ..dl_core.ball import Ball, crop_ball, disc_mask
 from ..dl_core.batches import Batches
-from ..dl_core.errors import ModelError, OptionError
+from ..dl_core.errors import OptionError
 from ..dl_core.finished import FinishedBalls, content_key
 from ..dl_core.painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
 from ..dl_core.shapes import BallImage, Image, Mask
+from .architecture import require_conditioning, require_control_net, require_sdxl, require_vae
 from .sampling import LEADING, SAMPLERS, SCHEDULERS, STOCHASTIC, BallNoise, sample, sigmas_of
 
 __all__ = ["ComfyPainter", "Guidance", "Networks"]
@@ -118,9 +117,11 @@ class ComfyPainter:
         Raises:
             ModelError: a model or conditioning of another architecture; the socket is named.
         """
-        _require_sdxl(networks)
+        require_sdxl(networks.model)
+        require_vae(networks.vae, networks.model)
+        require_control_net(networks.control_net)
         for socket in ("positive", "negative"):
-            _require_conditioning(socket, getattr(networks, socket), networks.model)
+            require_conditioning(socket, getattr(networks, socket), networks.model)
         self._networks, self._guidance = networks, guidance
         self._mask, self._on_balls = mask, on_balls
         self._finished = FinishedBalls(0) if finished is None else finished
@@ -308,32 +309,3 @@ def _decode_ball(vae: Any, samples: torch.Tensor, ball: Ball) -> BallImage:
 def _decode_margin(vae: Any) -> int:
     layers = vae.first_stage_model.modules()
     return NORMALIZING_MARGIN if any(isinstance(layer, torch.nn.GroupNorm) for layer in layers) else PLAIN_MARGIN
-
-
-def _require_sdxl(networks: Networks) -> None:
-    inner = getattr(networks.model, "model", None)
-    if not isinstance(inner, comfy.model_base.SDXL):
-        raise ModelError("socket model", f"holds {type(inner).__name__}; a model of SDXL's architecture is accepted")
-    channels = getattr(networks.vae, "latent_channels", None)
-    wanted = inner.latent_format.latent_channels
-    if channels != wanted:
-        raise ModelError("socket vae", f"holds a VAE of {channels} latent channels; the model's has {wanted}")
-    control_net = networks.control_net
-    if not isinstance(control_net, comfy.controlnet.ControlBase):
-        raise ModelError("socket control_net", f"holds {type(control_net).__name__}; a ControlNet is accepted")
-    network = getattr(control_net, "control_model", None)
-    if network is not None and getattr(network, "num_classes", "unknown") is None:
-        raise ModelError("socket control_net", "holds a ControlNet of another architecture; one for SDXL is accepted")
-
-
-def _require_conditioning(socket: str, conditioning: Any, model: Any) -> None:
-    wanted = model.model.model_config.unet_config["context_dim"]
-    if not conditioning:
-        raise ModelError(f"socket {socket}", "holds no conditioning")
-    for embedding, options in conditioning:
-        if embedding.shape[-1] != wanted or options.get("pooled_output") is None:
-            raise ModelError(
-                f"socket {socket}",
-                f"holds embeddings {embedding.shape[-1]} wide; the model takes {wanted} with a pooled output: "
-                "encode the prompt with the CLIP that belongs to the model",
-            )

@@ -330,7 +330,7 @@ def test_zero_balls_are_refused(node: Nodes, graph: Any, scene: Any) -> None:
         node("IterativeMedian").execute(**(ROUNDS | {"balls": 0}), **inputs(graph, scene))
 
 
-class Sd15:
+class OtherModel:
     """Stands where a graph holds another model: what a MODEL is to the check, and no more."""
 
     model = torch.nn.Identity()
@@ -339,7 +339,7 @@ class Sd15:
 @pytest.mark.parametrize(
     ("socket", "value", "message"),
     [
-        ("model", Sd15(), "socket model: holds Identity; a model of SDXL's architecture"),
+        ("model", OtherModel(), "socket model: holds Identity; a model of SDXL's architecture"),
         ("vae", object(), "socket vae: holds a VAE of None latent channels; the model's has 4"),
         ("control_net", object(), "socket control_net: holds object; a ControlNet"),
         ("positive", [[torch.zeros(1, 77, 768), {}]], "socket positive: holds embeddings 768 wide; the model takes 64"),
