@@ -17,7 +17,7 @@ from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ImageError
 from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
-from ..dl_core.painter import PaintRequest
+from ..dl_core.painter import IMPUTINGS, PaintRequest
 from ..dl_core.presets import PRESETS
 from .painter import ComfyPainter, Guidance, Networks
 from .progress import BarObserver
@@ -80,7 +80,7 @@ def _sampling_inputs() -> list[Any]:
         io.Combo.Input(
             "sampler",
             options=list(SAMPLERS),
-            tooltip="Samplers with one evaluation a step and no noise of their own, so that a seed fixes its ball. "
+            tooltip="Samplers with one evaluation a step. The last four draw noise at every step (lcm for LCM LoRAs). "
             "The paper: uni_pc.",
         ),
         io.Combo.Input(
@@ -104,6 +104,14 @@ def _sampling_inputs() -> list[Any]:
             tooltip="Balls painted at once; 0 lets free memory decide. It does not change the balls. Where a batch "
             "does not fit after all, it is halved, and the report says so.",
         ),
+        io.Combo.Input(
+            "impute",
+            options=list(IMPUTINGS),
+            default="initial",
+            optional=True,
+            tooltip="Noise put on the photograph outside the mask at every step. initial: what the ball started from, "
+            "as in the authors' code. predicted: what the model just predicted, as in the paper's Algorithm 0.",
+        ),
     ]
 
 
@@ -117,7 +125,7 @@ def _painter(observer: BarObserver, ball: Ball, mask: torch.Tensor | None, optio
     if mask is not None and mask.shape[-2:] != (ball.canvas, ball.canvas):
         raise ImageError("mask", f"has shape {tuple(mask.shape)}; the ball's canvas is {ball.canvas} x {ball.canvas}")
     networks = Networks(**{field.name: options[field.name] for field in fields(Networks)})
-    guidance = Guidance(**{field.name: options[field.name] for field in fields(Guidance)})
+    guidance = Guidance(**{field.name: options[field.name] for field in fields(Guidance) if field.name in options})
     return ComfyPainter(networks, guidance, mask=mask, on_balls=observer.preview, finished=FINISHED)
 
 

@@ -29,6 +29,14 @@ def comfyui_names(model: Any) -> dict[str, str]:
     return {ours.removesuffix(".weight"): theirs.removesuffix(".weight") for ours, theirs in table.items()}
 
 
+@pytest.fixture(autouse=True)
+def _nothing_loaded(pack: Any) -> None:
+    """ComfyUI takes the LoRA of the last run off a network only when it loads another; here it is patched directly."""
+    import comfy.model_management
+
+    comfy.model_management.unload_all_models()
+
+
 def random_lora(graph: Any, generator: torch.Generator) -> RandomLora:
     return RandomLora.on(attention_layers(lora_shapes(graph.mini)), generator)
 

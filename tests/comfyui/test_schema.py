@@ -92,6 +92,7 @@ def test_defaults_are_the_papers(schemas: dict[str, Any]) -> None:
         "preset": "custom",
         "sampler": "uni_pc",
         "scheduler": "leading (paper)",
+        "impute": "initial",
     }
     steering = {item.id: getattr(item, "default", None) for item in schemas["EVPromptInterp"].inputs}
     paper = pack_module("dl_core.presets").PAPER_EVS
