@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from dl_core.backends.mini import MiniModel, read_weights
 from dl_core.ball import Ball, crop_ball, paint_depth, place_ball
 from dl_core.errors import ImageError, Interrupted, ModelError, OptionError
 from dl_core.iterative import Rounds, rounds_evaluations
-from dl_core.painter import PaintRequest, SilentObserver
+from dl_core.painter import Imputing, PaintRequest, SilentObserver
 from dl_core.training.autoencoder import write_closed_form_encoder, write_thumbnail_decoder
 
 SIDE = 128
@@ -199,6 +200,22 @@ def test_imputing_with_the_predicted_noise_is_the_paper_s_listing(model: MiniMod
     code = DiffusersPainter.from_mini(model, sampler="ddim")
     balls = [painter.paint(request_, SilentObserver()).balls for painter in (listing, code)]
     assert (balls[0] - balls[1]).abs().mean() > 1e-4
+
+
+@pytest.mark.parametrize("impute", ["initial", "predicted"])
+def test_networks_in_half_precision_paint_the_same_ball(
+    model: MiniModel, request_: PaintRequest, impute: Imputing
+) -> None:
+    """As on a GPU: networks in half precision, the autoencoder and all that is summed up over steps in single."""
+    whole = DiffusersPainter.from_mini(model, impute=impute).paint(request_, SilentObserver()).balls
+    halved = deepcopy(model)
+    for network in (halved.unet, halved.controlnet, halved.text_encoder, halved.text_encoder_2):
+        network.to(torch.bfloat16)
+    painter = DiffusersPainter.from_mini(halved, impute=impute)
+    halves = painter.paint(request_, SilentObserver()).balls
+    assert halves.dtype == torch.float32
+    difference = (halves - whole).abs().mean()
+    assert 0 < difference < 0.02  # bfloat16 keeps 8 bits
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,9 @@ from typing import Any, Final
 import torch
 import torch.nn.functional as F
 from diffusers import (
-    ControlNetModel,
     DDIMScheduler,
     EulerDiscreteScheduler,
     StableDiffusionXLControlNetInpaintPipeline,
-    StableDiffusionXLPipeline,
     UniPCMultistepScheduler,
 )
 from jaxtyping import Float
@@ -33,6 +31,7 @@ from ..painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, 
 from ..shapes import BallImage, Image
 from .diffusers_lora import EXPOSURE, TURBO, add_lora
 from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults, read_weights
+from .sdxl_files import load_base, load_controlnet
 
 __all__ = ["SAMPLERS", "DiffusersPainter", "Guidance", "ball_latent_mask"]
 
@@ -151,11 +150,8 @@ class DiffusersPainter:
             raise OptionError("turbo_lora", str(turbo_lora), "none without an exposure LoRA, which follows it")
         device = "cuda" if torch.cuda.is_available() else "cpu"
         dtype = torch.float16 if device == "cuda" else torch.float32
-        base = _load(StableDiffusionXLPipeline, model, dtype)
-        _require_sdxl(model, base.unet)
-        control = _load(ControlNetModel, controlnet, dtype)
-        if control.config.cross_attention_dim != base.unet.config.cross_attention_dim:
-            raise ModelError(controlnet, "is not a ControlNet for SDXL (its text conditioning has another width)")
+        base = load_base(model, dtype)
+        control = load_controlnet(controlnet, base, dtype)
         pipeline = StableDiffusionXLControlNetInpaintPipeline(**base.components, controlnet=control)
         if lora is not None:
             add_lora(pipeline, read_weights(lora), EXPOSURE, lora)
@@ -241,7 +237,7 @@ class DiffusersPainter:
         return vae.encode((canvas.permute(0, 3, 1, 2) * 2 - 1).to(self._device, vae.dtype))
 
     def _start(self, encoded: Any, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-        """Clean latents of the canvas and initial noise of each ball, (n, 4, h, w) each.
+        """Clean latents of the canvas and initial noise of each ball, (n, 4, h, w) each, in single precision.
 
         A sampling autoencoder draws from the ball's generator before the noise does, as in the authors' code.
         """
@@ -250,8 +246,8 @@ class DiffusersPainter:
         for seed in seeds:
             generator = torch.Generator().manual_seed(seed)
             sample = encoded.latent_dist.sample(generator) if hasattr(encoded, "latent_dist") else encoded.latents
-            clean.append(sample * scale)
-            noise.append(torch.randn(sample.shape, generator=generator).to(sample))
+            clean.append(sample.float() * scale)
+            noise.append(torch.randn(sample.shape, generator=generator).to(clean[-1]))
         return torch.cat(clean), torch.cat(noise)
 
     def _denoiser(self, request: PaintRequest, count: int) -> Callable[[Tensor, Tensor], Tensor]:
@@ -269,7 +265,8 @@ class DiffusersPainter:
         depth = request.depth.permute(0, 3, 1, 2).to(tokens).expand(len(tokens), -1, -1, -1)
         unet, controlnet = self.pipeline.unet, self.pipeline.controlnet
 
-        def denoise(latents: Tensor, timestep: Tensor) -> Tensor:
+        def denoise(noisy: Tensor, timestep: Tensor) -> Tensor:
+            latents = noisy.to(unet.dtype)
             doubled = latents if scale == 1 else torch.cat((latents, latents))
             down, middle = controlnet(
                 doubled,
@@ -288,7 +285,7 @@ class DiffusersPainter:
                 down_block_additional_residuals=down,
                 mid_block_additional_residual=middle,
                 return_dict=False,
-            )[0]
+            )[0].float()
             if scale == 1:
                 return predicted
             unwanted, wanted = predicted.chunk(2)
@@ -349,20 +346,3 @@ def _predicted_noise(scheduler: Any, predicted: Tensor, latents: Tensor, timeste
         return predicted
     kept = scheduler.alphas_cumprod[int(timestep)].to(latents)
     return kept.sqrt() * predicted + (1 - kept).sqrt() * latents
-
-
-def _load(kind: Any, path: Path, dtype: torch.dtype) -> Any:
-    """A diffusers model or pipeline from a local file or folder."""
-    if not path.exists():
-        raise ModelError(path, "no such file or folder")
-    try:
-        if path.is_dir():
-            return kind.from_pretrained(path, torch_dtype=dtype, local_files_only=True)
-        return kind.from_single_file(str(path), torch_dtype=dtype, local_files_only=True)
-    except Exception as error:  # diffusers raises whatever its parts do; all of it means the same to the user
-        raise ModelError(path, f"cannot be loaded as {kind.__name__} ({type(error).__name__}: {error})") from error
-
-
-def _require_sdxl(path: Path, unet: Any) -> None:
-    if getattr(unet.config, "addition_embed_type", None) != "text_time" or unet.config.in_channels != 4:
-        raise ModelError(path, "is not an SDXL base model (its UNet lacks SDXL's text-and-size conditioning)")

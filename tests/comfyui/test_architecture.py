@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from comfy_host import pack_module
+from comfy_host import REPOSITORY, pack_module
 
 SD15: dict[str, Any] = {"cross_attention_dim": 768, "attention_head_dim": 8}
 """Stable Diffusion 1.5's UNet where it departs from diffusers' defaults."""
 
-SDXL: dict[str, Any] = {
-    "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
-    "block_out_channels": (320, 640, 1280),
-    "transformer_layers_per_block": (1, 2, 10),
-    "attention_head_dim": (5, 10, 20),
-    "cross_attention_dim": 2048,
-    "use_linear_projection": True,
-    "addition_embed_type": "text_time",
-    "addition_time_embed_dim": 256,
-    "projection_class_embeddings_input_dim": 2816,
-}
-SDXL_UP = {"up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D")}
+SDXL: dict[str, Any] = json.loads((REPOSITORY / "dl_core/data/sdxl/unet/config.json").read_text())
+CONTROL: dict[str, Any] = json.loads((REPOSITORY / "dl_core/data/sdxl/controlnet/config.json").read_text())
 
 REFINER: dict[str, Any] = SDXL | {
     "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D", "DownBlock2D"),
@@ -42,7 +33,7 @@ def unet_model(config: dict[str, Any]) -> Any:
     from diffusers import UNet2DConditionModel
 
     with torch.device("meta"):
-        weights = UNet2DConditionModel(**config).state_dict()
+        weights = UNet2DConditionModel.from_config(config).state_dict()
     detected = model_config_from_diffusers_unet(weights)
     detected.set_inference_dtype(torch.float32, None)
     return SimpleNamespace(model=detected.get_model({}, device="meta"))
@@ -64,7 +55,7 @@ def flux_model() -> Any:
 
 
 def test_the_base_model_is_accepted(pack: Any) -> None:
-    pack_module("nodes.architecture").require_sdxl(unet_model(SDXL | SDXL_UP))
+    pack_module("nodes.architecture").require_sdxl(unet_model(SDXL))
 
 
 @pytest.mark.parametrize(
@@ -72,8 +63,8 @@ def test_the_base_model_is_accepted(pack: Any) -> None:
     [
         (SD15, "socket model: holds SD15; a model of SDXL's architecture is accepted"),
         (REFINER, "socket model: holds SDXLRefiner; a model of SDXL's architecture is accepted"),
-        (SDXL | SDXL_UP | {"in_channels": 9}, "socket model: holds an SDXL of 9 input channels"),
-        (SDXL | SDXL_UP | {"in_channels": 8}, "socket model: holds an SDXL of 8 input channels"),
+        (SDXL | {"in_channels": 9}, "socket model: holds an SDXL of 9 input channels"),
+        (SDXL | {"in_channels": 8}, "socket model: holds an SDXL of 8 input channels"),
     ],
     ids=["sd15", "refiner", "inpainting", "instruct-pix2pix"],
 )
@@ -87,7 +78,7 @@ def test_flux_is_refused(pack: Any) -> None:
         pack_module("nodes.architecture").require_sdxl(flux_model())
 
 
-@pytest.mark.parametrize(("config", "accepted"), [(SDXL, True), (SD15, False)], ids=["sdxl", "sd15"])
+@pytest.mark.parametrize(("config", "accepted"), [(CONTROL, True), (SD15, False)], ids=["sdxl", "sd15"])
 @pytest.mark.filterwarnings("ignore:.*copying from a non-meta parameter.*:UserWarning")
 def test_control_nets(pack: Any, monkeypatch: pytest.MonkeyPatch, config: dict[str, Any], accepted: bool) -> None:
     """A ControlNet's file as diffusers writes it, loaded by ComfyUI's loader, again without values."""
@@ -96,7 +87,7 @@ def test_control_nets(pack: Any, monkeypatch: pytest.MonkeyPatch, config: dict[s
     from diffusers import ControlNetModel
 
     with torch.device("meta"):
-        weights = ControlNetModel(**config).state_dict()
+        weights = ControlNetModel.from_config(config).state_dict()
     monkeypatch.setattr(comfy.model_management, "unet_offload_device", lambda: torch.device("meta"))
     loaded = comfy.controlnet.load_controlnet_state_dict(dict(weights))
     require = pack_module("nodes.architecture").require_control_net
