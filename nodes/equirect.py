@@ -95,6 +95,16 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
                     optional=True,
                     tooltip="Radius and centre as Fit Ball found them; the ball has to be connected too.",
                 ),
+                io.Float.Input(
+                    "inset",
+                    default=0.0,
+                    min=-16.0,
+                    max=16.0,
+                    step=0.25,
+                    optional=True,
+                    tooltip="Pixels of the crop that the ball's edge lies inside the crop's, without a fit. The "
+                    "authors' unwrap takes 0.5 of a ball of 256.",
+                ),
             ],
             outputs=[
                 named_output(io.Image, "latlong", "The map, in the encoding of the image."),
@@ -119,11 +129,12 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
         fov: float = 60.0,
         frame: float = 4.0,
         fit: BallFit | None = None,
+        inset: float = 0.0,
     ) -> io.NodeOutput:
         """Cut out, unwrap, turn."""
         crop = _cut_out(as_rgb(image, "image"), ball)
         size = crop.shape[1]
-        circle = _circle(fit, ball)
+        circle = _circle(fit, ball, size / 2 - inset)
         camera = PROJECTIONS[projection](fov, *_picture(size, frame, ball))
         latlong = ball_to_latlong(crop, height, samples=samples, painted=True, projection=camera, **circle)
         coverage = latlong_coverage(height, size, projection=camera, **circle)[..., None]
@@ -133,14 +144,14 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
         return io.NodeOutput(latlong, coverage[..., 0])
 
 
-def _circle(fit: BallFit | None, ball: Ball | None) -> dict[str, Any]:
-    """Radius and centre of a fitted ball in its crop; nothing without a fit.
+def _circle(fit: BallFit | None, ball: Ball | None, radius: float) -> dict[str, Any]:
+    """Radius and centre of a fitted ball in its crop; without a fit the radius given, in the middle.
 
     Raises:
         OptionError: a fit without the ball it belongs to.
     """
     if fit is None:
-        return {}
+        return {"radius": radius}
     if ball is None:
         raise OptionError("ball", None, "the ball that was fitted, whose crop the image is")
     return {"radius": fit.radius, "centre": (fit.centre[0] - ball.left, fit.centre[1] - ball.top)}

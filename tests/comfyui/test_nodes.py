@@ -479,6 +479,15 @@ def test_a_fitted_circle_is_what_is_unwrapped(node: Nodes) -> None:
         node("BallToEquirect").execute(crop, fit=fit, **options)
 
 
+def test_an_inset_is_a_smaller_ball(node: Nodes) -> None:
+    geometry = pack_module("dl_core.geometry")
+    crop = torch.rand(1, 32, 32, 3, generator=torch.Generator().manual_seed(3))
+    found, _ = node("BallToEquirect").execute(crop, height=16, yaw=0.0, samples=1, inset=0.5).args
+    assert torch.equal(found, geometry.ball_to_latlong(crop, 16, samples=1, painted=True, radius=15.5))
+    plain, _ = node("BallToEquirect").execute(crop, height=16, yaw=0.0, samples=1).args
+    assert (found - plain).abs().max() > 0.01
+
+
 def test_fit_ball_keeps_the_circle_asked_for_where_nothing_tells(node: Nodes) -> None:
     place = pack_module("dl_core.ball").place_ball(256, 64)
     grey = torch.full((1, 64, 64, 3), 0.5)
