@@ -219,8 +219,8 @@ def test_the_lora_touches_attention_only_and_loads_into_the_painter(panoramas: T
 
 def test_scenes_are_drawn_once_and_read_back(tmp_path: Path) -> None:
     spoken: list[str] = []
-    draw_scenes(tmp_path, 2, 16, report=spoken.append)
-    draw_scenes(tmp_path, 3, 16, report=spoken.append)
+    draw_scenes(tmp_path, "drawn", 2, 16, report=spoken.append)
+    draw_scenes(tmp_path, "drawn", 3, 16, report=spoken.append)
     assert len(spoken) == 3
     bank = load_panoramas(None, tmp_path, height=16)
     # Half floats keep 11 bits.
@@ -228,7 +228,7 @@ def test_scenes_are_drawn_once_and_read_back(tmp_path: Path) -> None:
 
 
 def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="lightprobe train data"):
+    with pytest.raises(OptionError, match="lightprobe train scenes"):
         load_panoramas(None, tmp_path, height=16)
     with pytest.raises(OptionError, match=r"manifest\.json"):
         panorama_files(tmp_path, "training")
@@ -239,7 +239,7 @@ def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
 
 def test_a_work_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    options = argparse.Namespace(stage="data", work=tmp_path / "file" / "work", out=tmp_path, seed=1)
+    options = argparse.Namespace(stage="base", work=tmp_path / "file" / "work", out=tmp_path, seed=1)
     with pytest.raises(OptionError) as raised:
         run_stage(options, lambda line: None)
     assert raised.value.name == "--work"

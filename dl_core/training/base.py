@@ -17,7 +17,14 @@ __all__ = ["train_base"]
 
 
 def train_base(
-    model: MiniModel, sampler: SceneSampler, budget: Budget, folder: Path, *, batch: int, report: Callable[[str], None]
+    model: MiniModel,
+    sampler: SceneSampler,
+    budget: Budget,
+    folder: Path,
+    *,
+    batch: int,
+    fresh: bool = True,
+    report: Callable[[str], None],
 ) -> dict[str, dict[str, Tensor]]:
     """Train UNet and text encoders together.
 
@@ -27,6 +34,7 @@ def train_base(
         budget: steps and learning rate.
         folder: for checkpoints and the log.
         batch: pictures a step.
+        fresh: whether the networks have their random start, rather than weights to go on from.
         report: told of progress.
 
     Returns:
@@ -47,7 +55,7 @@ def train_base(
         return velocity_loss(predicted, drawn)
 
     networks = {name: getattr(model, name).train() for name in ("unet", "text_encoder", "text_encoder_2")}
-    if not (folder / "checkpoint.pt").is_file():
+    if fresh and not (folder / "checkpoint.pt").is_file():
         _wake_text_encoders(model)
     return train(networks, loss_of_step, budget, folder, report=report)
 

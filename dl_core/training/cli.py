@@ -1,67 +1,26 @@
-"""`lightprobe train STAGE`: the stages that make the mini model, in order: data, vae, base, control, lora.
-
-Each is seeded, checkpoints every two minutes under the work folder, and goes on from there when run again.
-Only the options are here, so that help comes without loading torch.
-"""
+"""`lightprobe train NAME`: scenes to train on, and what is trained, as a table."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
-__all__ = ["STAGES", "Stage", "add_arguments", "run"]
+from ..subcommands import Subcommand, add_subcommands
 
+__all__ = ["TRAININGS", "add_arguments", "run"]
 
-@dataclass(frozen=True)
-class Stage:
-    """A stage of training and what it does by default.
-
-    Attributes:
-        summary: one line for people.
-        steps: optimizer steps (for `data`: scenes drawn).
-        learning_rate: peak of the schedule.
-    """
-
-    summary: str
-    steps: int
-    learning_rate: float
-
-
-STAGES: Final[dict[str, Stage]] = {
-    "data": Stage("draw procedural skies and rooms", 240, 0.0),
-    "vae": Stage("write the closed-form encoder and train the decoder", 600, 4e-4),
-    "base": Stage("train UNet and text encoders", 2400, 4e-4),
-    "control": Stage("train the depth ControlNet, and the base further with it", 1600, 3e-4),
-    "lora": Stage("train the exposure LoRA on the finished base", 400, 1e-3),
+TRAININGS: Final[dict[str, Subcommand]] = {
+    "scenes": Subcommand("draw procedural skies and rooms, or path trace them", f"{__package__}.scenes_command"),
+    "mini": Subcommand("train a stage of the mini model", f"{__package__}.mini_command"),
 }
+"""The commands by name; a new one is a new row."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `lightprobe train`."""
-    add = parser.add_argument
-    add("stage", choices=STAGES, help="; ".join(f"{name}: {stage.summary}" for name, stage in STAGES.items()))
-    add("--panoramas", type=Path, help="folder of HDR maps whose manifest.json names a training split")
-    add("--work", type=Path, required=True, help="folder for scenes, checkpoints and logs")
-    add("--out", type=Path, help="folder of the mini model's files (default: the package's own)")
-    add("--steps", type=int, help="optimizer steps, or scenes for data (default: the stage's)")
-    add("--batch", type=int, default=8, help="pictures a step (default: 8)")
-    add("--learning-rate", type=float, help="peak learning rate (default: the stage's)")
-    add("--seed", type=int, default=1, help="of weights and pictures (default: 1)")
+    """Declare the commands; each declares its own options when it is chosen."""
+    add_subcommands(parser, TRAININGS, "training")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Run a stage of training; an error names the option."""
-    from .stages import run_stage
-
-    stage = STAGES[args.stage]
-    args.steps = stage.steps if args.steps is None else args.steps
-    args.learning_rate = stage.learning_rate if args.learning_rate is None else args.learning_rate
-    for path in run_stage(args, _report):
-        print(f"wrote {path}")
-
-
-def _report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+def run(args: argparse.Namespace) -> int | None:
+    """Run the chosen command."""
+    return TRAININGS[args.training].load().run(args)

@@ -29,9 +29,16 @@ _HINT: Final = "controlnet_cond_embedding."
 
 
 def train_control(
-    model: MiniModel, sampler: SceneSampler, budget: Budget, folder: Path, *, batch: int, report: Callable[[str], None]
+    model: MiniModel,
+    sampler: SceneSampler,
+    budget: Budget,
+    folder: Path,
+    *,
+    batch: int,
+    fresh: bool = True,
+    report: Callable[[str], None],
 ) -> dict[str, dict[str, Tensor]]:
-    """Train ControlNet (started as a copy of the UNet's encoder) and UNet together; text encoders stay as they are.
+    """Train ControlNet (its fresh start: the UNet's encoder) and UNet together; text encoders stay as they are.
 
     SDXL's ControlNets are trained on a frozen base. This base has seen a few ten thousand pictures, and being told
     where the ball is teaches it more of balls than as many pictures without.
@@ -42,7 +49,8 @@ def train_control(
     Args, Returns: as `base.train_base`.
     """
     control: Any = model.controlnet
-    control.load_state_dict(ControlNetModel.from_unet(model.unet).state_dict(), strict=False)
+    if fresh:
+        control.load_state_dict(ControlNetModel.from_unet(model.unet).state_dict(), strict=False)
     looking = control.controlnet_cond_embedding
     features = _Features(looking)
     # The trained part takes features in place of a picture, so that those of the usual ball are computed once.

@@ -5,18 +5,30 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Final
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ..errors import ImageError, OptionError
-from ..imageio import read_envmap, write_exr
+from ..errors import ImageError, OptionError, OutputError
+from ..imageio import read_envmap, require_writable, write_exr
 from ..shapes import Latlong
 from .procedural import draw_panorama
 
-__all__ = ["draw_scenes", "load_panoramas", "panorama_files", "reduce_panorama"]
+__all__ = ["KINDS", "draw_scenes", "load_panoramas", "panorama_files", "reduce_panorama"]
+
+
+def _render(seed: int, height: int) -> Latlong:
+    # Mitsuba is asked for only where something is to be rendered.
+    from .rendered import render_panorama
+
+    return render_panorama(seed, height)
+
+
+KINDS: Final[dict[str, Callable[[int, int], Latlong]]] = {"drawn": draw_panorama, "rendered": _render}
+"""Procedural scenes by kind: from a seed and a number of rows."""
 
 
 def panorama_files(folder: Path, split: str) -> list[Path]:
@@ -48,27 +60,32 @@ def reduce_panorama(latlong: Latlong, height: int) -> Float[Tensor, "b rows cols
     return F.avg_pool2d(latlong.permute(0, 3, 1, 2), factor).permute(0, 2, 3, 1)
 
 
-def draw_scenes(folder: Path, count: int, height: int, *, report: Callable[[str], None]) -> None:
-    """Draw procedural scenes (seeds 0 to count - 1) into a folder; those that are there already are kept.
+def draw_scenes(folder: Path, kind: str, count: int, height: int, *, report: Callable[[str], None]) -> None:
+    """Make procedural scenes of a kind (seeds 0 to count - 1) in a folder; those that are there already are kept.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OptionError: what makes the kind is not installed.
+        OutputError: the folder cannot be made or written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(folder, f"cannot be made ({error})") from error
+    require_writable(folder / f"{kind}.exr")
     for seed in range(count):
-        path = folder / f"scene_{seed:05d}.exr"
+        path = folder / f"{kind}_{seed:05d}.exr"
         if not path.is_file():
-            write_exr(path, draw_panorama(seed, height)[0], metadata={"seed": str(seed)})
+            write_exr(path, KINDS[kind](seed, height)[0], metadata={"seed": str(seed)})
             report(f"{path.name}: {seed + 1}/{count}")
 
 
 def load_panoramas(folder: Path | None, scenes: Path | None, *, height: int) -> Latlong:
-    """The training bank: the training split of `folder` and the drawn scenes in `scenes`.
+    """The training bank: the training split of `folder` and the procedural scenes in `scenes`.
 
-    Real maps are repeated until they are about as many as the drawn ones, so that a uniform draw sees both equally.
+    Real maps are repeated until they are about as many as the others, so that a uniform draw sees both equally.
 
     Args:
-        folder: HDR maps with a manifest; None for drawn scenes only.
+        folder: HDR maps with a manifest; None for procedural scenes only.
         scenes: folder of `draw_scenes`; None for real maps only.
         height: rows of every map of the bank.
 
@@ -79,10 +96,10 @@ def load_panoramas(folder: Path | None, scenes: Path | None, *, height: int) -> 
         OptionError: neither is given, or a folder holds nothing of use.
         ImageError: a map that cannot be read.
     """
-    drawn_files = sorted(scenes.glob("scene_*.exr")) if scenes is not None else []
+    drawn_files = sorted(path for kind in KINDS for path in scenes.glob(f"{kind}_*.exr")) if scenes is not None else []
     real_files = panorama_files(folder, "training") if folder is not None else []
     if not drawn_files and not real_files:
-        raise OptionError("panoramas", str(folder), "a folder of HDR maps, or scenes made by `lightprobe train data`")
+        raise OptionError("panoramas", str(folder), "a folder of HDR maps, or scenes made by `lightprobe train scenes`")
     repeats = max(1, len(drawn_files) // max(1, len(real_files)))
     real, drawn = (
         [reduce_panorama(read_envmap(path), height) for path in files] for files in (real_files, drawn_files)

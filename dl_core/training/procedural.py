@@ -10,6 +10,7 @@ continue; they are not meant as ground truth of light transport.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import torch
 import torch.nn.functional as F
@@ -19,21 +20,38 @@ from torch import Generator, Tensor
 from ..geometry import latlong_directions
 from ..shapes import Directions, Latlong
 
-__all__ = ["draw_panorama", "draw_room", "draw_sky"]
+__all__ = [
+    "MEDIAN",
+    "draw_panorama",
+    "draw_room",
+    "draw_sky",
+    "random_colour",
+    "random_log_uniform",
+    "random_uniform",
+]
+
+MEDIAN: Final = 0.2
+"""Median luminance of the panoramas drawn."""
 
 
-def _uniform(generator: Generator, low: float, high: float) -> float:
+def random_uniform(generator: Generator, low: float, high: float) -> float:
+    """A number drawn evenly from low to high."""
     return low + (high - low) * float(torch.rand((), generator=generator))
 
 
-def _log_uniform(generator: Generator, low: float, high: float) -> float:
-    return math.exp(_uniform(generator, math.log(low), math.log(high)))
+def random_log_uniform(generator: Generator, low: float, high: float) -> float:
+    """A number whose logarithm is drawn evenly, from low to high, both above 0."""
+    return math.exp(random_uniform(generator, math.log(low), math.log(high)))
 
 
-def _colour(generator: Generator, saturation: float) -> Float[Tensor, "3"]:
+def random_colour(generator: Generator, saturation: float) -> Float[Tensor, "3"]:
     """A random colour of mean 1, each channel within `saturation` of it."""
     colour = 1 + saturation * (2 * torch.rand(3, generator=generator) - 1)
     return colour / colour.mean()
+
+
+def _random_sizes(generator: Generator, *spans: tuple[float, float]) -> Float[Tensor, "3"]:
+    return torch.tensor([random_uniform(generator, *span) for span in spans])
 
 
 def _noise_map(generator: Generator, height: int, octaves: int) -> Latlong:
@@ -65,22 +83,22 @@ def draw_sky(generator: Generator, height: int) -> Latlong:
     overcast = float(torch.rand((), generator=generator)) ** 2
     towards_sun = (directions * sun).sum(-1, keepdim=True)
 
-    zenith = torch.tensor([0.22, 0.42, 0.9]) * _colour(generator, 0.2)
-    horizon = torch.tensor([0.75, 0.8, 0.85]) * _colour(generator, 0.25) * _uniform(generator, 0.8, 1.8)
-    falloff = torch.exp(-elevation.clamp(min=0) * _uniform(generator, 1.5, 5))
+    zenith = torch.tensor([0.22, 0.42, 0.9]) * random_colour(generator, 0.2)
+    horizon = torch.tensor([0.75, 0.8, 0.85]) * random_colour(generator, 0.25) * random_uniform(generator, 0.8, 1.8)
+    falloff = torch.exp(-elevation.clamp(min=0) * random_uniform(generator, 1.5, 5))
     sky = zenith * (1 - falloff) + horizon * falloff
-    sky = sky + torch.exp((towards_sun - 1) * _uniform(generator, 4, 30)) * _colour(generator, 0.2) * 1.2
-    clouds = torch.sigmoid((_noise_map(generator, height, 5)[0] - _uniform(generator, -0.5, 2)) * 3)
-    sky = sky * (1 - clouds) + clouds * _uniform(generator, 0.5, 1.6) * (0.7 + 0.6 * towards_sun.clamp(min=0))
-    sky = sky * (1 - overcast) + overcast * (0.5 + 0.5 * elevation.clamp(min=0)) * _colour(generator, 0.1)
-    disc = torch.sigmoid((towards_sun - math.cos(math.radians(_uniform(generator, 1.2, 3)))) * 4000)
+    sky = sky + torch.exp((towards_sun - 1) * random_uniform(generator, 4, 30)) * random_colour(generator, 0.2) * 1.2
+    clouds = torch.sigmoid((_noise_map(generator, height, 5)[0] - random_uniform(generator, -0.5, 2)) * 3)
+    sky = sky * (1 - clouds) + clouds * random_uniform(generator, 0.5, 1.6) * (0.7 + 0.6 * towards_sun.clamp(min=0))
+    sky = sky * (1 - overcast) + overcast * (0.5 + 0.5 * elevation.clamp(min=0)) * random_colour(generator, 0.1)
+    disc = torch.sigmoid((towards_sun - math.cos(math.radians(random_uniform(generator, 1.2, 3)))) * 4000)
     warmth = 1 - torch.tensor([0.0, 0.35, 0.75]) * math.exp(-4 * max(0.0, float(sun[1])))
-    sun_level = _log_uniform(generator, 30, 3000) * (1 - overcast) ** 3
+    sun_level = random_log_uniform(generator, 30, 3000) * (1 - overcast) ** 3
     sky = sky + disc * sun_level * warmth
 
-    albedo = _uniform(generator, 0.08, 0.5) * _colour(generator, 0.4)
+    albedo = random_uniform(generator, 0.08, 0.5) * random_colour(generator, 0.4)
     texture = (1 + 0.35 * _noise_map(generator, height, 6)[0]).clamp(0.2, 2)
-    lit = 0.35 + (1 - overcast) * max(0.0, float(sun[1])) * _uniform(generator, 0.2, 1.5)
+    lit = 0.35 + (1 - overcast) * max(0.0, float(sun[1])) * random_uniform(generator, 0.2, 1.5)
     ground = albedo * texture * lit
     skyline = _skyline(generator, directions)
     above = torch.sigmoid((elevation - skyline) * 150)
@@ -88,7 +106,7 @@ def draw_sky(generator: Generator, height: int) -> Latlong:
 
 
 def _sun_direction(generator: Generator) -> Float[Tensor, "3"]:
-    azimuth, elevation = _uniform(generator, -math.pi, math.pi), math.radians(_uniform(generator, 3, 75))
+    azimuth, elevation = random_uniform(generator, -math.pi, math.pi), math.radians(random_uniform(generator, 3, 75))
     level = math.cos(elevation)
     return torch.tensor([level * math.sin(azimuth), math.sin(elevation), -level * math.cos(azimuth)])
 
@@ -98,10 +116,10 @@ def _skyline(generator: Generator, directions: Directions) -> Float[Tensor, "h w
     azimuth = torch.atan2(directions[..., 0:1], -directions[..., 2:3])
     profile = torch.zeros_like(azimuth)
     for harmonic in range(1, 7):
-        phase, gain = _uniform(generator, 0, 2 * math.pi), _uniform(generator, 0, 0.12 / harmonic)
+        phase, gain = random_uniform(generator, 0, 2 * math.pi), random_uniform(generator, 0, 0.12 / harmonic)
         profile = profile + gain * torch.sin(harmonic * azimuth + phase)
     if float(torch.rand((), generator=generator)) < 0.5:
-        blocks = torch.rand(24, generator=generator) * _uniform(generator, 0.05, 0.6)
+        blocks = torch.rand(24, generator=generator) * random_uniform(generator, 0.05, 0.6)
         profile = profile + blocks[((azimuth / (2 * math.pi) + 0.5) * 23.99).long()]
     return profile
 
@@ -112,15 +130,17 @@ def draw_room(generator: Generator, height: int) -> Latlong:
     Args, Returns: as `draw_sky`.
     """
     directions = latlong_directions(height)
-    half = torch.tensor([_uniform(generator, 1.5, 6), _uniform(generator, 1.2, 2.0), _uniform(generator, 1.5, 6)])
+    half = torch.tensor(
+        [random_uniform(generator, 1.5, 6), random_uniform(generator, 1.2, 2.0), random_uniform(generator, 1.5, 6)]
+    )
     eye = (torch.rand(3, generator=generator) * 1.2 - 0.6) * half
     points, normals, wall = _hit_box(directions, eye, half)
     albedo = _wall_colours(generator)[wall] * (1 + 0.2 * _noise_map(generator, height, 6)[0]).clamp(0.3, 1.6)
     points, normals, albedo = _furnish(generator, directions, eye, half, (points, normals, albedo))
 
-    light = _uniform(generator, 0.05, 0.4) * _colour(generator, 0.15) * torch.ones_like(albedo)
+    light = random_uniform(generator, 0.05, 0.4) * random_colour(generator, 0.15) * torch.ones_like(albedo)
     emitted = torch.zeros_like(albedo)
-    for _ in range(1 + int(_uniform(generator, 0, 4.99))):
+    for _ in range(1 + int(random_uniform(generator, 0, 4.99))):
         corner, edge_u, edge_v, radiance, picture = _lamp(generator, half, height)
         light = light + _irradiance(points, normals, corner, edge_u, edge_v) * radiance
         emitted = torch.maximum(emitted, _inside(points, corner, edge_u, edge_v) * radiance * picture)
@@ -138,10 +158,10 @@ def _hit_box(directions: Directions, eye: Tensor, half: Tensor) -> tuple[Tensor,
 
 
 def _wall_colours(generator: Generator) -> Float[Tensor, "6 3"]:
-    wall = _uniform(generator, 0.3, 0.8) * _colour(generator, 0.25)
-    colours = [wall * _uniform(generator, 0.8, 1.2) for _ in range(6)]
-    colours[2] = _uniform(generator, 0.1, 0.5) * _colour(generator, 0.4)  # floor
-    colours[3] = _uniform(generator, 0.6, 0.9) * _colour(generator, 0.05)  # ceiling
+    wall = random_uniform(generator, 0.3, 0.8) * random_colour(generator, 0.25)
+    colours = [wall * random_uniform(generator, 0.8, 1.2) for _ in range(6)]
+    colours[2] = random_uniform(generator, 0.1, 0.5) * random_colour(generator, 0.4)  # floor
+    colours[3] = random_uniform(generator, 0.6, 0.9) * random_colour(generator, 0.05)  # ceiling
     return torch.stack(colours)
 
 
@@ -151,9 +171,13 @@ def _furnish(
     """Put blocks on the floor in front of what the rays hit."""
     points, normals, albedo = surface
     inverse = 1 / torch.where(directions == 0, 1e-9, directions)
-    for _ in range(int(_uniform(generator, 0, 6))):
+    for _ in range(int(random_uniform(generator, 0, 6))):
         size = torch.tensor(
-            [_uniform(generator, 0.2, 0.9), _uniform(generator, 0.2, 0.8), _uniform(generator, 0.2, 0.9)]
+            [
+                random_uniform(generator, 0.2, 0.9),
+                random_uniform(generator, 0.2, 0.8),
+                random_uniform(generator, 0.2, 0.9),
+            ]
         )
         centre = (torch.rand(3, generator=generator) * 2 - 1) * half
         centre[1] = -half[1] + size[1]
@@ -167,7 +191,7 @@ def _furnish(
         facing = torch.zeros_like(directions).scatter_(-1, axis, -torch.sign(torch.gather(directions, -1, axis)))
         points = torch.where(hit, eye + directions * entry, points)
         normals = torch.where(hit, facing, normals)
-        albedo = torch.where(hit, _uniform(generator, 0.1, 0.8) * _colour(generator, 0.6), albedo)
+        albedo = torch.where(hit, random_uniform(generator, 0.1, 0.8) * random_colour(generator, 0.6), albedo)
     return points, normals, albedo
 
 
@@ -175,25 +199,25 @@ def _lamp(generator: Generator, half: Tensor, height: int) -> tuple[Tensor, Tens
     """A ceiling lamp or a window: corner, two edges, radiance (3,), and a picture it shows (per direction)."""
     picture = torch.ones(height, 2 * height, 1)
     if float(torch.rand((), generator=generator)) < 0.55:
-        size = torch.tensor([_log_uniform(generator, 0.1, 1.5), 0.0, _log_uniform(generator, 0.1, 1.5)])
+        size = torch.tensor([random_log_uniform(generator, 0.1, 1.5), 0.0, random_log_uniform(generator, 0.1, 1.5)])
         corner = (torch.rand(3, generator=generator) * 2 - 1) * (half - size.clamp(max=1.4))
         corner[1] = half[1]
-        warm = torch.tensor([1.0, _uniform(generator, 0.55, 1.0), 0.0])
-        warm[2] = warm[1] * _uniform(generator, 0.4, 1.1)
-        level = _log_uniform(generator, 4, 60) / max(0.15, float(size[0] * size[2])) ** 0.5
+        warm = torch.tensor([1.0, random_uniform(generator, 0.55, 1.0), 0.0])
+        warm[2] = warm[1] * random_uniform(generator, 0.4, 1.1)
+        level = random_log_uniform(generator, 4, 60) / max(0.15, float(size[0] * size[2])) ** 0.5
         edges = torch.tensor([float(size[0]), 0, 0]), torch.tensor([0, 0, float(size[2])])
         return corner, *edges, warm * level, picture
-    across = _uniform(generator, 0.6, 2.5)
-    bottom = _uniform(generator, -0.4, 0.2) * float(half[1])
-    top = min(bottom + _uniform(generator, 0.7, 1.6), float(half[1]))
+    across = random_uniform(generator, 0.6, 2.5)
+    bottom = random_uniform(generator, -0.4, 0.2) * float(half[1])
+    top = min(bottom + random_uniform(generator, 0.7, 1.6), float(half[1]))
     wall, along = (0, 2) if float(torch.rand((), generator=generator)) < 0.5 else (2, 0)
     corner, edge = torch.zeros(3), torch.zeros(3)
     corner[wall] = half[wall] * (1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0)
-    corner[along] = half[along] * _uniform(generator, -1, 0.3)
+    corner[along] = half[along] * random_uniform(generator, -1, 0.3)
     corner[1] = bottom
     edge[along] = across
     picture = (1 + 0.4 * _noise_map(generator, height, 4)[0]).clamp(min=0.2)
-    daylight = torch.tensor([0.8, 0.95, 1.1]) * _colour(generator, 0.2) * _log_uniform(generator, 1, 25)
+    daylight = torch.tensor([0.8, 0.95, 1.1]) * random_colour(generator, 0.2) * random_log_uniform(generator, 1, 25)
     return corner, edge, torch.tensor([0.0, top - bottom, 0.0]), daylight, picture
 
 
@@ -232,9 +256,9 @@ def draw_panorama(seed: int, height: int = 128) -> Latlong:
         height: rows of the map.
 
     Returns:
-        (1, height, 2 height, 3) linear radiance scaled to a median luminance of about 0.2.
+        (1, height, 2 height, 3) linear radiance scaled to a median luminance of `MEDIAN`.
     """
     generator = torch.Generator().manual_seed(seed)
     fine = (draw_sky if seed % 2 == 0 else draw_room)(generator, 2 * height)
     panorama = F.avg_pool2d(fine.permute(0, 3, 1, 2), 2).permute(0, 2, 3, 1)
-    return panorama * (0.2 / panorama.mean(dim=-1).median().clamp(min=1e-3))
+    return panorama * (MEDIAN / panorama.mean(dim=-1).median().clamp(min=1e-3))

@@ -1,4 +1,4 @@
-"""What the stages of `lightprobe train` do; their options are in `cli.py`."""
+"""What the stages of `lightprobe train mini` do; their options are in `mini_command.py`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .decoder import train_decoder
 from .export import write_lora, write_networks
 from .loop import Budget
 from .lora import train_lora
-from .panoramas import draw_scenes, load_panoramas
+from .panoramas import load_panoramas
 from .scenes import SceneSampler
 
 __all__ = ["run_stage"]
@@ -29,7 +29,7 @@ SKETCH: Final = 2
 """The denoiser sees blocks of 8 pixels only; pictures at half size give it the same for a quarter of the work."""
 
 SCENE_ROWS: Final = 256
-"""Rows of the drawn scenes, and of the maps the decoder learns detail from."""
+"""Rows of the maps the decoder learns detail from."""
 
 SKETCH_ROWS: Final = 128
 """Rows of the maps behind half-size pictures."""
@@ -39,7 +39,7 @@ def _sampler(
     args: argparse.Namespace, model: MiniModel, *, scale: int = SKETCH, bracket: bool = False, centred: float = 0.7
 ) -> SceneSampler:
     rows = SKETCH_ROWS if scale == SKETCH else SCENE_ROWS
-    bank = load_panoramas(args.panoramas, args.work / "scenes", height=rows)
+    bank = load_panoramas(args.panoramas, args.scenes, height=rows)
     canvas, diameter = model.defaults.canvas // scale, model.defaults.diameter // scale
     ev_min = model.defaults.ev_min
     return SceneSampler(bank, canvas, diameter, args.seed, bracket=bracket, centred=centred, ev_min=ev_min)
@@ -47,11 +47,6 @@ def _sampler(
 
 def _budget(args: argparse.Namespace) -> Budget:
     return Budget(args.steps, args.learning_rate)
-
-
-def _data(args: argparse.Namespace, report: Report) -> list[Path]:
-    draw_scenes(args.work / "scenes", args.steps, SCENE_ROWS, report=report)
-    return [args.work / "scenes"]
 
 
 def _vae(args: argparse.Namespace, report: Report) -> list[Path]:
@@ -62,16 +57,20 @@ def _vae(args: argparse.Namespace, report: Report) -> list[Path]:
 
 
 def _base(args: argparse.Namespace, report: Report) -> list[Path]:
-    model = MiniModel.untrained(args.out)
+    model = load_mini(args.out, without=("controlnet",)) if args.go_on else MiniModel.untrained(args.out)
     sampler = _sampler(args, model)
-    weights = train_base(model, sampler, _budget(args), args.work / "base", batch=args.batch, report=report)
+    weights = train_base(
+        model, sampler, _budget(args), args.work / "base", batch=args.batch, fresh=not args.go_on, report=report
+    )
     return write_networks(args.out, weights)
 
 
 def _control(args: argparse.Namespace, report: Report) -> list[Path]:
-    model = load_mini(args.out, without=("controlnet",))
+    model = load_mini(args.out, without=() if args.go_on else ("controlnet",))
     sampler = _sampler(args, model, centred=0.85)
-    weights = train_control(model, sampler, _budget(args), args.work / "control", batch=args.batch, report=report)
+    weights = train_control(
+        model, sampler, _budget(args), args.work / "control", batch=args.batch, fresh=not args.go_on, report=report
+    )
     return write_networks(args.out, weights)
 
 
@@ -83,7 +82,6 @@ def _lora(args: argparse.Namespace, report: Report) -> list[Path]:
 
 
 _STAGES: Final[dict[str, Callable[[argparse.Namespace, Report], list[Path]]]] = {
-    "data": _data,
     "vae": _vae,
     "base": _base,
     "control": _control,
