@@ -37,6 +37,7 @@ __all__ = [
     "MiniModel",
     "ModelDefaults",
     "load_mini",
+    "load_network",
     "read_weights",
 ]
 
@@ -185,6 +186,18 @@ def _rename_text_keys(weights: dict[str, torch.Tensor], network: nn.Module) -> d
     return {name.removeprefix(prefix): tensor for name, tensor in weights.items()}
 
 
+def load_network(network: nn.Module, path: Path, what: str) -> None:
+    """Load a file of a network's weights in place; `what` names the network in errors.
+
+    Raises:
+        ModelError: the file is missing, unreadable, or holds another architecture.
+    """
+    try:
+        network.load_state_dict(_rename_text_keys(read_weights(path), network))
+    except RuntimeError as error:
+        raise ModelError(path, f"holds another architecture than the mini model's {what} ({error})") from error
+
+
 def load_mini(folder: Path = MINI_FOLDER, *, without: Collection[str] = ()) -> MiniModel:
     """Load the mini model.
 
@@ -199,10 +212,6 @@ def load_mini(folder: Path = MINI_FOLDER, *, without: Collection[str] = ()) -> M
     for name, network in model.networks().items():
         if name in without:
             continue
-        path = folder / NETWORK_FILES[name]
-        try:
-            network.load_state_dict(_rename_text_keys(read_weights(path), network))
-        except RuntimeError as error:
-            raise ModelError(path, f"holds another architecture than the mini model's {name} ({error})") from error
+        load_network(network, folder / NETWORK_FILES[name], name)
     lora = read_weights(folder / LORA_FILE) if (folder / LORA_FILE).exists() else None
     return MiniModel(**{**{field.name: getattr(model, field.name) for field in fields(model)}, "lora": lora})

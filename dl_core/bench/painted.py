@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import asdict
+from collections.abc import Collection
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,7 @@ from ..errors import OptionError
 from ..estimate import Settings
 from ..imageio import read_envmap, read_exr_header
 from ..presets import Preset, preset
+from .baselines import BASELINES, answer_maps, open_baselines
 from .cameras import CAMERAS
 from .journal import fingerprint
 from .painters import PAINTERS, open_studio
@@ -43,6 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--panoramas", type=Path, metavar="DIR", help="folder of true EXR or HDR maps, instead of --maps and --truth")
     add("--painter", default="mini", help=f"{', '.join(PAINTERS)} (default: mini)")
     add("--variants", default="both", help=f"rows of the ablation: {','.join(VARIANTS)}, or all (default: both)")
+    add("--baselines", help=f"rows to compare with: {','.join(BASELINES)}, or all (default: none)")
+    add("--regressor", type=Path, metavar="DIR", help="the regressor's files, of `lightprobe train mini regressor`")
     add("--preset", default="draft", help="schedule and bracket (default: draft)")
     add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
     for name, what in _FILES.items():
@@ -57,18 +61,23 @@ def run(args: argparse.Namespace) -> int:
     """
     if args.out is None:
         raise OptionError("--out", None, "a folder for the painted maps")
-    variants = _variants(args.variants)
-    paintings = list(planned(panorama_files(args.panoramas), args.protocol, variants, args.seed))
+    variants = _names(args.variants, VARIANTS, "--variants")
+    panoramas = panorama_files(args.panoramas)
+    paintings = list(planned(panoramas, args.protocol, variants, args.seed))
+    compared = _names(args.baselines, BASELINES, "--baselines") if args.baselines else []
+    answers = list(planned(panoramas, args.protocol, compared, args.seed))
     chosen = preset(args.preset)
     prepare_output(args)
     started = time.perf_counter()
     files = ModelFiles.of(args)
     studio = open_studio(args.painter, files)
     settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
+    baselines = open_baselines(compared, args.regressor, replace(settings, evs=chosen.evs))
     paint_maps(
         paintings, studio.painter_of, chosen, settings, args.out, painter=_identity(args.painter, files), report=_say
     )
-    rows = [row for painting in paintings for row in _score(painting, args)]
+    answer_maps(answers, baselines, args.out, report=_say)
+    rows = [row for painting in (*paintings, *answers) for row in _score(painting, args)]
     report = Report(
         f"protocol {args.protocol}",
         _description(args, settings, chosen),
@@ -96,11 +105,11 @@ def _say(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
-def _variants(text: str) -> list[str]:
-    names = list(VARIANTS) if text == "all" else text.split(",")
+def _names(text: str, table: Collection[str], option: str) -> list[str]:
+    names = list(table) if text == "all" else text.split(",")
     for name in names:
-        if name not in VARIANTS:
-            raise OptionError("--variants", name, ", ".join((*VARIANTS, "all")))
+        if name not in table:
+            raise OptionError(option, name, ", ".join((*table, "all")))
     return names
 
 
@@ -135,14 +144,15 @@ def _description(args: argparse.Namespace, settings: Settings, chosen: Preset) -
 
 
 def _summarize(rows: list[Row]) -> list[Row]:
-    """Errors over the maps, a record for each variant and sphere."""
+    """Errors over the maps, a record for each variant or baseline and sphere."""
     summary = []
-    for variant in VARIANTS:
+    labels = {name: variant.label for name, variant in VARIANTS.items()} | BASELINES
+    for variant, label in labels.items():
         for sphere in dict.fromkeys(row["sphere"] for row in rows):
             own = [row for row in rows if row["variant"] == variant and row["sphere"] == sphere]
             if not own:
                 continue
-            head = {"method": VARIANTS[variant].label, "sphere": sphere, "maps": len(own)}
+            head = {"method": label, "sphere": sphere, "maps": len(own)}
             summary.append({**head, **summarize_errors(own)})
     return summary
 

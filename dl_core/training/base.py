@@ -13,7 +13,7 @@ from .denoiser import TextBank, draw_batch, time_ids, velocity_loss
 from .loop import Budget, train
 from .scenes import SceneSampler
 
-__all__ = ["train_base"]
+__all__ = ["train_base", "wake_text_encoders"]
 
 
 def train_base(
@@ -56,12 +56,12 @@ def train_base(
 
     networks = {name: getattr(model, name).train() for name in ("unet", "text_encoder", "text_encoder_2")}
     if fresh and not (folder / "checkpoint.pt").is_file():
-        _wake_text_encoders(model)
+        wake_text_encoders(model)
     return train(networks, loss_of_step, budget, folder, report=report)
 
 
 @torch.no_grad()
-def _wake_text_encoders(model: MiniModel) -> None:
+def wake_text_encoders(model: MiniModel) -> None:
     """CLIP starts its embeddings at a deviation of 0.02, too faint for a UNet to hear within a short training."""
     generator = torch.Generator().manual_seed(49408)
     for encoder in (model.text_encoder, model.text_encoder_2):

@@ -32,6 +32,7 @@ __all__ = [
     "Batch",
     "TextBank",
     "draw_batch",
+    "latent_disc",
     "time_ids",
     "velocity_loss",
 ]
@@ -111,7 +112,7 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     high_levels = torch.randint(600, 1000, (size,), generator=generator)
     levels = torch.where(torch.rand(size, generator=generator) < noisiest, high_levels, levels)
     noise = torch.randn(clean.shape, generator=generator)
-    discs = torch.cat([_disc(picture.ball, clean.shape[-1]) for picture in pictures])
+    discs = torch.cat([latent_disc(picture.ball, clean.shape[-1]) for picture in pictures])
     blind = torch.rand(size, generator=generator) < (levels - BLIND_FROM) / (BLIND_ABOVE - BLIND_FROM)
     shown = clean * (1 - discs * blind.view(-1, 1, 1, 1))
     return Batch(
@@ -125,7 +126,7 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     )
 
 
-def _disc(ball: Ball, side: int) -> Float[Tensor, "1 1 m m"]:
+def latent_disc(ball: Ball, side: int) -> Float[Tensor, "1 1 m m"]:
     """The inpaint disc at latent size: the share of each latent that it covers."""
     return torch.nn.functional.interpolate(disc_mask(ball, grow=ball.dilation)[None], size=(side, side), mode="area")
 

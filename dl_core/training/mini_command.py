@@ -1,5 +1,7 @@
 """`lightprobe train mini STAGE`: the stages that make the mini model, in order: vae, base, control, lora.
 
+Stages `mean` and `regressor` make what the benches compare it with.
+
 Each is seeded, checkpoints every two minutes under the work folder, and goes on from there when run again.
 Only the options are here, so that help comes without loading torch.
 """
@@ -21,7 +23,7 @@ class Stage:
 
     Attributes:
         summary: one line for people.
-        steps: optimizer steps.
+        steps: optimizer steps; for `mean`, pictures.
         learning_rate: peak of the schedule.
     """
 
@@ -35,6 +37,10 @@ STAGES: Final[dict[str, Stage]] = {
     "base": Stage("train UNet and text encoders", 2400, 4e-4),
     "control": Stage("train the depth ControlNet, and the base further with it", 1600, 3e-4),
     "lora": Stage("train the exposure LoRA on the finished base", 400, 1e-3),
+    "mean": Stage("the mean of all training light, to compare with", 4000, 0.0),
+    "regressor": Stage(
+        "train the base's networks to give balls at once, to compare with; written to --work", 2400, 4e-4
+    ),
 }
 
 

@@ -13,11 +13,18 @@ from typing import Final, Literal
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float
 from torch import Generator, Tensor
 
 from ..ball import Ball, crop_ball, place_ball
 from ..exposure import auto_exposure, expose
-from ..geometry import ball_coverage, camera_rotation, latlong_to_perspective, sample_latlong
+from ..geometry import (
+    ball_coverage,
+    camera_rotation,
+    latlong_to_perspective,
+    rotate_latlong,
+    sample_latlong,
+)
 from ..projection import disc_directions
 from ..prompts import DARK_PROMPT, NEGATIVE_PROMPT, PROMPT
 from ..shapes import BallImage, Image, Latlong
@@ -83,6 +90,21 @@ class SceneSampler:
     def draw(self, index: int) -> Picture:
         """The picture of an index."""
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
+        light, rotation, photo = self._view(generator)
+        canvas = expose(photo, 0.0)
+        ball = self._place(generator)
+        look, ev, caption = self._bracket_kind(generator) if self.bracket else _base_kind(generator)
+        radiance = _reflect(light, rotation, ball.diameter, look, generator)
+        crop = expose(radiance, ev)
+        return Picture(_blend(canvas, crop, ball), ball, ev, caption)
+
+    def light(self, index: int) -> Latlong:
+        """The light around the picture of an index, (1, H, 2H, 3): as its camera stands, on its scale of exposure."""
+        light, rotation, _ = self._view(torch.Generator().manual_seed(self.seed * 1_000_003 + index))
+        return rotate_latlong(light, rotation)
+
+    def _view(self, generator: Generator) -> tuple[Latlong, Tensor, Float[Tensor, "1 side side 3"]]:
+        """A panorama on the scale of a photograph's exposure, the camera's rotation, and the photograph; radiance."""
         panorama = self._panorama(generator)
         rotation = camera_rotation(
             yaw=_uniform(generator, -180, 180),
@@ -91,12 +113,7 @@ class SceneSampler:
         )
         photo = self._photograph(generator, panorama, rotation)
         scale = auto_exposure(photo[photo.amax(dim=-1) > 0]) * 2 ** _uniform(generator, -0.3, 0.3)
-        canvas = expose(photo * scale, 0.0)
-        ball = self._place(generator)
-        look, ev, caption = self._bracket_kind(generator) if self.bracket else _base_kind(generator)
-        radiance = _reflect(panorama * scale, rotation, ball.diameter, look, generator)
-        crop = expose(radiance, ev)
-        return Picture(_blend(canvas, crop, ball), ball, ev, caption)
+        return panorama * scale, rotation, photo * scale
 
     def _panorama(self, generator: Generator) -> Latlong:
         panorama = self.panoramas[int(torch.randint(len(self.panoramas), (), generator=generator))][None]

@@ -18,7 +18,9 @@ from .decoder import train_decoder
 from .export import write_lora, write_networks
 from .loop import Budget
 from .lora import train_lora
+from .mean_light import mean_light, write_mean_light
 from .panoramas import load_panoramas
+from .regressor import train_regressor
 from .scenes import SceneSampler
 
 __all__ = ["run_stage"]
@@ -74,6 +76,18 @@ def _control(args: argparse.Namespace, report: Report) -> list[Path]:
     return write_networks(args.out, weights)
 
 
+def _mean(args: argparse.Namespace, report: Report) -> list[Path]:
+    sampler = _sampler(args, MiniModel.untrained(args.out))
+    return [write_mean_light(args.out, mean_light(sampler, args.steps), args.steps)]
+
+
+def _regressor(args: argparse.Namespace, report: Report) -> list[Path]:
+    model = MiniModel.untrained(args.out)
+    sampler = _sampler(args, model, bracket=True)
+    weights = train_regressor(model, sampler, _budget(args), args.work / "regressor", batch=args.batch, report=report)
+    return write_networks(args.work / "regressor", weights)
+
+
 def _lora(args: argparse.Namespace, report: Report) -> list[Path]:
     model = load_mini(args.out, without=("controlnet",))
     sampler = _sampler(args, model, bracket=True)
@@ -86,6 +100,8 @@ _STAGES: Final[dict[str, Callable[[argparse.Namespace, Report], list[Path]]]] = 
     "base": _base,
     "control": _control,
     "lora": _lora,
+    "mean": _mean,
+    "regressor": _regressor,
 }
 
 
