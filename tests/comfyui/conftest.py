@@ -165,4 +165,4 @@ def _no_gradients() -> Iterator[None]:
 def _no_finished_balls() -> None:
     """Every test starts with nothing painted, as after a start of ComfyUI."""
     if installed():
-        pack_module("nodes.inpaint").FINISHED.clear()
+        pack_module("nodes.painting").FINISHED.clear()
