@@ -8,6 +8,7 @@ from .depth_ball import CanvasToImage, DepthBallMask
 from .depth_model import EstimateDepth
 from .envmap_files import LoadEnvMap, SaveEnvMap
 from .equirect import BallToEquirect, EquirectToBall
+from .estimate_light import EstimateLight
 from .exposure import EVPromptInterp, HDRMerge
 from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
@@ -29,6 +30,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     FitBall,
     BallToEquirect,
     EquirectToBall,
+    EstimateLight,
     SaveEnvMap,
     LoadEnvMap,
 )

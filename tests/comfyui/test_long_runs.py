@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from comfy_host import pack_module
+from counted_network import watched
 from torch.profiler import ProfilerActivity, profile
 
 PAINTING = {
@@ -39,28 +39,6 @@ def run(node: Nodes, graph: Any, scene: Any, **changes: Any) -> Any:
     """Outputs of IterativeMedian: ball, median, spread, composite, report."""
     places = {"image": scene.canvas, "depth": scene.depth, "ball": scene.ball, "mask": scene.mask}
     return node("IterativeMedian").execute(**{**graph.sockets(), **places, **PAINTING, **ROUNDS, **changes}).args
-
-
-class CountedNetwork:
-    """Counts the pictures a network evaluates; it may be told to do something at one of them."""
-
-    def __init__(self, then: Callable[[int, int], None] = lambda count, batch: None) -> None:
-        self.count = 0
-        self._then = then
-
-    def __call__(self, module: Any, arguments: tuple[torch.Tensor, ...]) -> None:
-        self.count += len(arguments[0])
-        self._then(self.count, len(arguments[0]))
-
-
-@contextmanager
-def watched(graph: Any, then: Callable[[int, int], None] = lambda count, batch: None) -> Iterator[CountedNetwork]:
-    counted = CountedNetwork(then)
-    handle = graph.model.model.diffusion_model.register_forward_pre_hook(counted)
-    try:
-        yield counted
-    finally:
-        handle.remove()
 
 
 # --- interrupted and queued again --------------------------------------------------------------------------------
