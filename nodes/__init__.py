@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from comfy_api.latest import ComfyExtension, io
 
+from .ball_grid import BallGrid
 from .depth_ball import CanvasToImage, DepthBallMask
 from .depth_model import EstimateDepth
 from .envmap_files import LoadEnvMap, SaveEnvMap
@@ -13,6 +14,7 @@ from .exposure import EVPromptInterp, HDRMerge
 from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
+from .photo_folder import LoadPhotoFolder
 from .turbo import TurboLoRASwap
 
 __all__ = ["NODES", "LightProbeExtension"]
@@ -31,6 +33,8 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     BallToEquirect,
     EquirectToBall,
     EstimateLight,
+    BallGrid,
+    LoadPhotoFolder,
     SaveEnvMap,
     LoadEnvMap,
 )

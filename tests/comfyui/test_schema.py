@@ -33,6 +33,8 @@ SOCKETS = {
         "model clip vae control_net image depth depth_model",
         "latlong hdr composite balls ball report",
     ),
+    "BallGrid": ("image", "x y name"),
+    "LoadPhotoFolder": ("", "images names report"),
     "SaveEnvMap": ("latlong report", "path"),
     "LoadEnvMap": ("", "latlong"),
 }
