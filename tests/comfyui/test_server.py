@@ -117,7 +117,8 @@ def test_paper_workflow_has_the_papers_settings() -> None:
     wanted = {"preset": "custom", "balls": 30, "rounds": 2, "strength": 0.8, "final": True, "steps": 30, "cfg": 5.0}
     wanted |= {"sampler": "uni_pc", "scheduler": "leading (paper)", "control_strength": 0.5}
     assert {name: paint[name] for name in wanted} == wanted
-    assert (nodes["DepthBallMask"]["canvas"], nodes["DepthBallMask"]["diameter"]) == (1024, 256)
+    place = nodes["DepthBallMask"]
+    assert (place["canvas"], place["diameter"], place["depth_disc"]) == (1024, 256, "authors")
     assert nodes["EVPromptInterp"]["evs"] == "0, -2.5, -5"
     assert (nodes["LoraLoader"]["strength_model"], nodes["LoraLoader"]["strength_clip"]) == (0.75, 0.0)
     assert nodes["EVPromptInterp"]["lora"] == "none"
