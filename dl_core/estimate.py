@@ -76,21 +76,25 @@ class Probe:
     evaluations: int
 
 
-def check_photograph(photo_ldr: Image) -> Image:
+def check_photograph(photo_ldr: Image, source: str = "photograph") -> Image:
     """A photograph as (1, H, W, 3) floats in [0, 1].
+
+    Args:
+        photo_ldr: what should be one.
+        source: what an error calls it.
 
     Raises:
         ImageError: another layout, NaN, or values outside [0, 1].
     """
     if photo_ldr.ndim != 4 or photo_ldr.shape[0] != 1 or photo_ldr.shape[3] != 3:
-        raise ImageError("photograph", f"has shape {tuple(photo_ldr.shape)}, (1, height, width, 3) is accepted")
+        raise ImageError(source, f"has shape {tuple(photo_ldr.shape)}, (1, height, width, 3) is accepted")
     if photo_ldr.numel() == 0:
-        raise ImageError("photograph", f"is empty ({photo_ldr.shape[2]} x {photo_ldr.shape[1]})")
+        raise ImageError(source, f"is empty ({photo_ldr.shape[2]} x {photo_ldr.shape[1]})")
     if not torch.isfinite(photo_ldr).all():
-        raise ImageError("photograph", "holds NaN or infinite values")
+        raise ImageError(source, "holds NaN or infinite values")
     low, high = float(photo_ldr.min()), float(photo_ldr.max())
     if low < 0 or high > 1:
-        raise ImageError("photograph", f"holds values from {low:g} to {high:g}; display values in [0, 1] are accepted")
+        raise ImageError(source, f"holds values from {low:g} to {high:g}; display values in [0, 1] are accepted")
     return photo_ldr
 
 

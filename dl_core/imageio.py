@@ -62,7 +62,7 @@ PHOTOGRAPH_FORMATS: Final = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "AVIF", "JPEG
 PIXEL_LIMIT: Final = 175_000_000
 """Pixels a photograph may declare; Pillow itself refuses 179 million."""
 KEPT_SIDE: Final = 2048
-"""Pixels of the longer side that reading keeps at least: twice the canvas that photographs are fitted in."""
+"""Pixels of the longer side that reading keeps at least unless told otherwise: twice the canvas of SDXL."""
 ROWS_LIMIT: Final = 8192
 """Rows an environment map may declare."""
 RENDER_LIMIT: Final = 2 * ROWS_LIMIT**2
@@ -274,16 +274,17 @@ def tone_map_preview(latlong_hdr: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 
 # --- photographs -------------------------------------------------------------------------------------------------
 
 
-def read_photograph(path: str | Path) -> Image:
+def read_photograph(path: str | Path, *, kept_side: int = KEPT_SIDE) -> Image:
     """Read a photograph of any layout as display-encoded RGB.
 
     Grey, palette, CMYK and 16-bit pictures are converted, EXIF orientation is applied, transparency is laid on black
-    (as the bars beside a photograph on its canvas are), and the first frame of several counts. Pictures of 4,096
-    pixels and more are averaged over whole blocks down to no less than 2,048 pixels on the longer side, JPEGs while
-    they are decoded, so that size costs little memory. Colour profiles are not applied.
+    (as the bars beside a photograph on its canvas are), and the first frame of several counts. Pictures at least twice
+    as large as `kept_side` are averaged over whole blocks down to no less than that, JPEGs while they are decoded, so
+    that size costs little memory. Colour profiles are not applied.
 
     Args:
         path: of the file, in one of `PHOTOGRAPH_FORMATS`.
+        kept_side: pixels of the longer side that are kept at least, 1 or more.
 
     Returns:
         (1, H, W, 3) float32 in [0, 1].
@@ -294,9 +295,9 @@ def read_photograph(path: str | Path) -> Image:
     path = Path(path)
     try:
         with _open_photograph(path) as picture:
-            factor = max(1, max(picture.size) // KEPT_SIDE)
+            factor = max(1, max(picture.size) // kept_side)
             picture.draft(None, (picture.width // factor, picture.height // factor))
-            oriented = ImageOps.exif_transpose(_reduce(_displayable(path, picture)))
+            oriented = ImageOps.exif_transpose(_reduce(_displayable(path, picture), kept_side))
             return _picture_tensor(oriented)
     except ImageError:
         raise
@@ -341,8 +342,8 @@ def _displayable(path: Path, picture: PILImage.Image) -> PILImage.Image:
     return picture if picture.mode == "RGB" else picture.convert("RGB")
 
 
-def _reduce(picture: PILImage.Image) -> PILImage.Image:
-    factor = max(picture.size) // KEPT_SIDE
+def _reduce(picture: PILImage.Image, kept_side: int) -> PILImage.Image:
+    factor = max(picture.size) // kept_side
     if factor < 2:
         return picture
     reduced = picture.reduce(factor)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from comfy_api.latest import ComfyExtension, io
 
+from .ball_grid import BallGrid
 from .depth_ball import CanvasToImage, DepthBallMask
 from .depth_model import EstimateDepth
 from .envmap_files import LoadEnvMap, SaveEnvMap
 from .equirect import BallToEquirect, EquirectToBall
+from .estimate_light import EstimateLight
 from .exposure import EVPromptInterp, HDRMerge
 from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
+from .photo_folder import LoadPhotoFolder
 from .turbo import TurboLoRASwap
 
 __all__ = ["NODES", "LightProbeExtension"]
@@ -29,6 +32,9 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     FitBall,
     BallToEquirect,
     EquirectToBall,
+    EstimateLight,
+    BallGrid,
+    LoadPhotoFolder,
     SaveEnvMap,
     LoadEnvMap,
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from comfy_api.latest import io
 
@@ -20,10 +22,70 @@ from ..dl_core.ball import (
 from ..dl_core.estimate import check_photograph
 from .sockets import CATEGORY, BallSocket, as_rgb, named_output
 
-__all__ = ["CanvasToImage", "DepthBallMask"]
+__all__ = ["AUTOMATIC", "CanvasToImage", "DepthBallMask", "depth_input", "given", "place_inputs", "size_inputs"]
 
 AUTOMATIC = -1
 """Widget value that stands for "not given": ComfyUI's number widgets cannot be empty."""
+
+
+def given(value: int) -> int | None:
+    """The value of a widget that may stand for "not given"."""
+    return None if value == AUTOMATIC else value
+
+
+def depth_input(otherwise: str) -> Any:
+    """Depth of the photograph.
+
+    Args:
+        otherwise: sentence on what is done without it.
+    """
+    return io.Image.Input(
+        "depth",
+        optional=True,
+        tooltip=f"Depth of the photograph with near bright, such as MiDaS or Depth Anything give it. {otherwise}",
+    )
+
+
+def size_inputs() -> list[Any]:
+    """Sizes of canvas and ball."""
+    return [
+        io.Int.Input(
+            "canvas",
+            default=1024,
+            min=64,
+            max=4096,
+            step=8,
+            tooltip="Side of the canvas in pixels: 1024 for SDXL, 256 for the mini model.",
+        ),
+        io.Int.Input(
+            "diameter",
+            default=256,
+            min=16,
+            max=4096,
+            tooltip="Of the ball in pixels: 256 on SDXL's canvas, 128 on the mini model's.",
+        ),
+    ]
+
+
+def place_inputs() -> list[Any]:
+    """Sizes of canvas and ball, and where the ball goes."""
+    return [
+        *size_inputs(),
+        io.Int.Input(
+            "x",
+            default=AUTOMATIC,
+            min=AUTOMATIC,
+            max=4096,
+            tooltip="Column of the ball's centre on the canvas; -1 is the middle.",
+        ),
+        io.Int.Input(
+            "y",
+            default=AUTOMATIC,
+            min=AUTOMATIC,
+            max=4096,
+            tooltip="Row of the ball's centre on the canvas; -1 is the middle.",
+        ),
+    ]
 
 
 class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
@@ -40,41 +102,8 @@ class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
             "a white disc on the depth map, since the ball is nearest, and a slightly larger disc to inpaint.",
             inputs=[
                 io.Image.Input("image", tooltip="One photograph, any size."),
-                io.Image.Input(
-                    "depth",
-                    optional=True,
-                    tooltip="Depth of the photograph with near bright, such as MiDaS or Depth Anything give it. "
-                    "Without one the scene counts as far away.",
-                ),
-                io.Int.Input(
-                    "canvas",
-                    default=1024,
-                    min=64,
-                    max=4096,
-                    step=8,
-                    tooltip="Side of the canvas in pixels: 1024 for SDXL, 256 for the mini model.",
-                ),
-                io.Int.Input(
-                    "diameter",
-                    default=256,
-                    min=16,
-                    max=4096,
-                    tooltip="Of the ball in pixels: 256 on SDXL's canvas, 128 on the mini model's.",
-                ),
-                io.Int.Input(
-                    "x",
-                    default=AUTOMATIC,
-                    min=AUTOMATIC,
-                    max=4096,
-                    tooltip="Column of the ball's centre on the canvas; -1 is the middle.",
-                ),
-                io.Int.Input(
-                    "y",
-                    default=AUTOMATIC,
-                    min=AUTOMATIC,
-                    max=4096,
-                    tooltip="Row of the ball's centre on the canvas; -1 is the middle.",
-                ),
+                depth_input("Without one the scene counts as far away."),
+                *place_inputs(),
                 io.Int.Input(
                     "dilation",
                     default=AUTOMATIC,
@@ -114,13 +143,9 @@ class DepthBallMask(io.ComfyNode):  # type: ignore[misc]
     ) -> io.NodeOutput:
         """Fit, place, paint."""
         photo = check_photograph(as_rgb(image, "image"))
-        ball = place_ball(canvas, diameter, x=_given(x), y=_given(y), dilation=_given(dilation), depth_disc=depth_disc)
+        ball = place_ball(canvas, diameter, x=given(x), y=given(y), dilation=given(dilation), depth_disc=depth_disc)
         mask = disc_mask(ball, grow=ball.dilation)
         return io.NodeOutput(fit_canvas(photo, canvas), paint_depth(depth, ball), mask, ball)
-
-
-def _given(value: int) -> int | None:
-    return None if value == AUTOMATIC else value
 
 
 class CanvasToImage(io.ComfyNode):  # type: ignore[misc]

@@ -16,7 +16,17 @@ from ..dl_core.prompts import DARK_PROMPT, PROMPT
 from .lora import read_lora_file, with_lora
 from .sockets import CATEGORY, as_rgb, named_output, parse_evs, parse_numbers
 
-__all__ = ["EVPromptInterp", "HDRMerge", "interpolate_conditioning"]
+__all__ = [
+    "EVPromptInterp",
+    "HDRMerge",
+    "bracket_conditionings",
+    "bracket_inputs",
+    "encode_prompt",
+    "interpolate_conditioning",
+    "merge_input",
+    "merge_summary",
+    "prompt_inputs",
+]
 
 NO_LORA: Final = "none"
 
@@ -73,6 +83,78 @@ def _shares(evs: Sequence[float], ev_min: float, weights: str) -> list[float]:
     return list(shares)
 
 
+def bracket_conditionings(
+    original: Any, dark: Any, evs: Sequence[float], ev_min: float, weights: str = ""
+) -> list[Any]:
+    """One conditioning per EV, each interpolated between the two originals.
+
+    Args:
+        original: CONDITIONING of the prompt, at EV 0.
+        dark: CONDITIONING of the dark prompt, at `ev_min`.
+        evs: exposure values, descending from 0.
+        ev_min: exposure value of the dark prompt, below 0.
+        weights: share of the dark prompt at each EV, written between commas; EV / EV min when empty.
+
+    Raises:
+        OptionError: EVs below `ev_min` or weights that do not fit the EVs, and as `interpolate_conditioning`.
+        ModelError: as `interpolate_conditioning`.
+    """
+    return [interpolate_conditioning(original, dark, share) for share in _shares(evs, ev_min, weights)]
+
+
+def encode_prompt(clip: Any, prompt: str) -> Any:
+    """CONDITIONING of a text, as ComfyUI's own node makes it.
+
+    Raises:
+        ModelError: no text encoders.
+    """
+    if clip is None:
+        raise ModelError("socket clip", "holds no text encoders; those of the model are accepted")
+    return clip.encode_from_tokens_scheduled(clip.tokenize(prompt))
+
+
+def prompt_inputs() -> list[Any]:
+    """The two prompts that exposures lie between."""
+    return [
+        io.String.Input("prompt", default=PROMPT, multiline=True, tooltip="A mirror ball at EV 0."),
+        io.String.Input("dark_prompt", default=DARK_PROMPT, multiline=True, tooltip="A mirror ball at EV min."),
+    ]
+
+
+def bracket_inputs() -> list[Any]:
+    """The exposures, and where the dark prompt stands among them."""
+    return [
+        io.String.Input(
+            "evs",
+            default="0, -2.5, -5",
+            tooltip="Exposure values between commas: they start at 0 and descend. The paper's are 0, -2.5, -5.",
+        ),
+        io.Float.Input(
+            "ev_min",
+            default=-5.0,
+            min=-20.0,
+            max=-0.1,
+            step=0.1,
+            tooltip="The exposure value of the dark prompt, as the exposure LoRA was trained: -5.",
+        ),
+    ]
+
+
+def merge_input(name: str) -> Any:
+    """How exposures become radiance."""
+    return io.Combo.Input(
+        name,
+        options=list(MERGES),
+        tooltip="robust: each colour by itself, errors of exposure undone. "
+        "channel: each colour by itself always. paper: luminance only, with the chroma of EV 0.",
+    )
+
+
+def merge_summary(evs: Sequence[float], method: str, gamma: float = GAMMA) -> str:
+    """The line of a report on how exposures were merged."""
+    return f"Merged EV {', '.join(f'{value:g}' for value in evs)} by the method {method}, gamma {gamma:g}."
+
+
 class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
     """Conditionings that steer the exposure of a ball."""
 
@@ -96,21 +178,8 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
                 io.Conditioning.Input(
                     "dark", optional=True, tooltip="A conditioning for EV min, in place of the dark prompt below."
                 ),
-                io.String.Input("prompt", default=PROMPT, multiline=True, tooltip="A mirror ball at EV 0."),
-                io.String.Input("dark_prompt", default=DARK_PROMPT, multiline=True, tooltip="A mirror ball at EV min."),
-                io.String.Input(
-                    "evs",
-                    default="0, -2.5, -5",
-                    tooltip="Exposure values between commas: they start at 0 and descend. The paper's are 0, -2.5, -5.",
-                ),
-                io.Float.Input(
-                    "ev_min",
-                    default=-5.0,
-                    min=-20.0,
-                    max=-0.1,
-                    step=0.1,
-                    tooltip="The exposure value of the dark prompt, as the exposure LoRA was trained: -5.",
-                ),
+                *prompt_inputs(),
+                *bracket_inputs(),
                 io.Combo.Input(
                     "lora",
                     options=[NO_LORA, *folder_paths.get_filename_list("loras")],
@@ -157,9 +226,8 @@ class EVPromptInterp(io.ComfyNode):  # type: ignore[misc]
     ) -> io.NodeOutput:
         """Encode both prompts once and interpolate between these originals for every EV."""
         values = check_evs(parse_evs(evs))
-        shares = _shares(values, ev_min, weights)
         bright, black = _encoded(clip, prompt, original), _encoded(clip, dark_prompt, dark)
-        positive = [interpolate_conditioning(bright, black, share) for share in shares]
+        positive = bracket_conditionings(bright, black, values, ev_min, weights)
         return io.NodeOutput(_with_lora(model, lora, lora_scale), positive, list(values))
 
 
@@ -173,7 +241,7 @@ def _encoded(clip: Any, prompt: str, conditioning: Any) -> Any:
         return conditioning
     if clip is None:
         raise ModelError("socket clip", "is not connected; connect it, or both original and dark in its place")
-    return clip.encode_from_tokens_scheduled(clip.tokenize(prompt))
+    return encode_prompt(clip, prompt)
 
 
 def _with_lora(model: Any, lora: str, scale: float) -> Any:
@@ -204,12 +272,7 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
             inputs=[
                 io.Image.Input("balls", tooltip="One display-encoded ball per EV, as a list."),
                 io.Float.Input("ev", force_input=True, tooltip="The EVs of the balls, as a list: 0 first, descending."),
-                io.Combo.Input(
-                    "method",
-                    options=list(MERGES),
-                    tooltip="robust: each colour by itself, errors of exposure undone. "
-                    "channel: each colour by itself always. paper: luminance only, with the chroma of EV 0.",
-                ),
+                merge_input("method"),
                 io.Float.Input(
                     "gamma",
                     default=GAMMA,
@@ -242,5 +305,4 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
     ) -> io.NodeOutput:
         """Merge; every input is a list, options have one item."""
         merged = merge_bracket([as_rgb(ball, "balls") for ball in balls], ev, method[0], gamma[0])
-        summary = f"Merged EV {', '.join(f'{value:g}' for value in ev)} by the method {method[0]}, gamma {gamma[0]:g}."
-        return io.NodeOutput(merged, "\n".join([*report, summary]))
+        return io.NodeOutput(merged, "\n".join([*report, merge_summary(ev, method[0], gamma[0])]))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 from time import perf_counter
-from typing import Any, Final
+from typing import Any
 
 import torch
 from comfy_api.latest import io
@@ -15,33 +15,36 @@ from comfy_api.latest import io
 from ..dl_core.ball import Ball, paste_ball, require_canvas
 from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ImageError
-from ..dl_core.finished import FinishedBalls
-from ..dl_core.iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
-from ..dl_core.painter import IMPUTINGS, PaintRequest
-from ..dl_core.presets import PRESETS
-from .painter import ComfyPainter, Guidance, Networks
+from ..dl_core.iterative import iterative_inpaint, rounds_evaluations
+from ..dl_core.painter import PaintRequest
+from .painter import ComfyPainter, Networks
+from .painting import (
+    CUSTOM,
+    comfy_painter,
+    depth_model_input,
+    exposure_lines,
+    guidance_of,
+    model_input,
+    network_inputs,
+    one_picture,
+    rounds_inputs,
+    rounds_of,
+    sampling_inputs,
+    seed_input,
+)
 from .progress import BarObserver
-from .sampling import SAMPLERS, SCHEDULERS
-from .sockets import CATEGORY, BallSocket, DepthModelSocket, as_rgb, named_output
+from .sockets import CATEGORY, BallSocket, named_output
 
 __all__ = ["ChromeBallInpaint", "IterativeMedian"]
-
-CUSTOM: Final = "custom"
-"""Preset that leaves the node's own values in force."""
-
-FINISHED: Final = FinishedBalls(256 * 2**20)
-"""Balls of the runs before, so that a graph queued again after an interrupt goes on where it was: 256 MiB hold those of
-five exposures of the paper's schedule, 61 balls each at 256 pixels."""
 
 
 def _shared_inputs() -> list[Any]:
     """Sockets of every node that paints."""
     return [
-        io.Model.Input("model", tooltip="The denoiser, of SDXL's architecture, with the exposure LoRA loaded."),
+        model_input(),
         io.Conditioning.Input("positive", tooltip="The ball's prompt at the exposure to paint."),
         io.Conditioning.Input("negative", tooltip="What to move away from: matte, diffuse, flat, dull."),
-        io.Vae.Input("vae", tooltip="The autoencoder of the model."),
-        io.ControlNet.Input("control_net", tooltip="A depth ControlNet of SDXL's architecture."),
+        *network_inputs(),
         io.Image.Input("image", tooltip="The canvas image of Depth Ball Mask."),
         io.Image.Input("depth", tooltip="The control depth of Depth Ball Mask."),
         BallSocket.Input("ball", tooltip="Where the ball sits."),
@@ -54,64 +57,7 @@ def _shared_inputs() -> list[Any]:
             force_input=True,
             tooltip="The exposure value, for the report; it changes nothing else.",
         ),
-        io.Int.Input(
-            "seed",
-            default=0,
-            min=0,
-            max=2**53,
-            control_after_generate=True,
-            tooltip="Of the first ball; the next ones count up. The same seed starts from the same noise at every EV.",
-        ),
-    ]
-
-
-def _sampling_inputs() -> list[Any]:
-    """How every node that paints samples."""
-    return [
-        io.Int.Input("steps", default=30, min=1, max=998, tooltip="Denoising steps of a full schedule. The paper: 30."),
-        io.Float.Input(
-            "cfg",
-            default=5.0,
-            min=1.0,
-            max=30.0,
-            step=0.1,
-            tooltip="Guidance scale. The paper: 5. At 1 the negative prompt is left out, at half the cost.",
-        ),
-        io.Combo.Input(
-            "sampler",
-            options=list(SAMPLERS),
-            tooltip="Samplers with one evaluation a step. The last four draw noise at every step (lcm for LCM LoRAs). "
-            "The paper: uni_pc.",
-        ),
-        io.Combo.Input(
-            "scheduler",
-            options=list(SCHEDULERS),
-            tooltip="leading (paper) visits the timesteps of the paper's schedule; the others are ComfyUI's.",
-        ),
-        io.Float.Input(
-            "control_strength",
-            default=0.5,
-            min=0.0,
-            max=2.0,
-            step=0.05,
-            tooltip="Of the depth ControlNet. The paper: 0.5.",
-        ),
-        io.Int.Input(
-            "batch_size",
-            default=0,
-            min=0,
-            max=64,
-            tooltip="Balls painted at once; 0 lets free memory decide. It does not change the balls. Where a batch "
-            "does not fit after all, it is halved, and the report says so.",
-        ),
-        io.Combo.Input(
-            "impute",
-            options=list(IMPUTINGS),
-            default="initial",
-            optional=True,
-            tooltip="Noise put on the photograph outside the mask at every step. initial: what the ball started from, "
-            "as in the authors' code. predicted: what the model just predicted, as in the paper's Algorithm 0.",
-        ),
+        seed_input(),
     ]
 
 
@@ -125,8 +71,7 @@ def _painter(observer: BarObserver, ball: Ball, mask: torch.Tensor | None, optio
     if mask is not None and mask.shape[-2:] != (ball.canvas, ball.canvas):
         raise ImageError("mask", f"has shape {tuple(mask.shape)}; the ball's canvas is {ball.canvas} x {ball.canvas}")
     networks = Networks(**{field.name: options[field.name] for field in fields(Networks)})
-    guidance = Guidance(**{field.name: options[field.name] for field in fields(Guidance) if field.name in options})
-    return ComfyPainter(networks, guidance, mask=mask, on_balls=observer.preview, finished=FINISHED)
+    return comfy_painter(observer, networks, guidance_of(options), mask)
 
 
 def _request(
@@ -137,13 +82,9 @@ def _request(
     Raises:
         ImageError: pictures of another size than the ball's canvas, more than one, or not finite.
     """
-    pictures = {"image": as_rgb(image, "image"), "depth": as_rgb(depth, "depth")}
-    for socket, picture in pictures.items():
+    pictures = {"image": one_picture(image, "image"), "depth": one_picture(depth, "depth")}
+    for picture in pictures.values():
         require_canvas(picture, ball)
-        if len(picture) != 1:
-            raise ImageError(socket, f"holds {len(picture)} pictures; one is accepted")
-        if not torch.isfinite(picture).all():
-            raise ImageError(socket, "holds NaN or infinite values")
     return PaintRequest(pictures["image"], pictures["depth"], ball, ev, seeds, **schedule)
 
 
@@ -170,7 +111,7 @@ class ChromeBallInpaint(io.ComfyNode):  # type: ignore[misc]
                     step=0.01,
                     tooltip="1 paints from pure noise; below, from the noised image: 0.8 runs the last 24 of 30 steps.",
                 ),
-                *_sampling_inputs(),
+                *sampling_inputs(),
             ],
             outputs=[
                 named_output(io.Image, "balls", "The balls, cut out, display-encoded, in the order of their seeds."),
@@ -217,42 +158,10 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
             "again from there. The median keeps what the scene decides of the ball and drops what the noise decides.",
             inputs=[
                 *_shared_inputs(),
-                io.Combo.Input(
-                    "preset",
-                    options=[CUSTOM, *PRESETS],
-                    tooltip="A point between speed and accuracy; it replaces balls, rounds, strength, final and steps "
-                    "below. custom uses the values below.",
-                ),
-                io.Int.Input("balls", default=30, min=1, max=1000, tooltip="N, the balls of a median. The paper: 30."),
-                io.Int.Input(
-                    "rounds",
-                    default=2,
-                    min=0,
-                    max=100,
-                    tooltip="k, medians taken. The paper: 2. At 0 one ball is painted, and that is all.",
-                ),
-                io.Float.Input(
-                    "strength",
-                    default=0.8,
-                    min=0.01,
-                    max=1.0,
-                    step=0.01,
-                    tooltip="Share of the schedule that later rounds and the last ball run. The paper: 0.8.",
-                ),
-                io.Boolean.Input(
-                    "final",
-                    default=True,
-                    tooltip="Paint one more ball from the last median, as the paper does; otherwise the median itself "
-                    "is the answer: cheaper and softer.",
-                ),
-                *_sampling_inputs(),
+                *rounds_inputs(CUSTOM),
+                *sampling_inputs(),
                 # Last, so that saved workflows keep the order of their widgets.
-                DepthModelSocket.Input(
-                    "depth_model",
-                    optional=True,
-                    tooltip="Of Estimate Depth: estimates depth again on every median, as the authors' code does. "
-                    "Without one all rounds use depth.",
-                ),
+                depth_model_input("Without one all rounds use depth."),
             ],
             outputs=[
                 named_output(io.Image, "ball", "The answer, cut out, display-encoded."),
@@ -282,23 +191,13 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         **options: Any,
     ) -> io.NodeOutput:
         """Run Algorithm 1."""
-        schedule = Rounds(balls, rounds, strength, steps, final) if preset == CUSTOM else PRESETS[preset].rounds
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps)
         request = _request(image, depth, ball, ev, (seed,))
         observer = BarObserver()
         painter = _painter(observer, ball, mask, options)
         observer.expect(rounds_evaluations(painter, schedule))
         started = perf_counter()
         result = iterative_inpaint(painter, request, schedule, observer, depth_of=depth_model)
-        report = _report(request, schedule, result, perf_counter() - started)
+        report = exposure_lines(ev, seed, schedule, result, perf_counter() - started)
         composite = paste_ball(request.canvas, result.ball, ball)
         return io.NodeOutput(result.ball, result.median, result.spread, composite, report)
-
-
-def _report(request: PaintRequest, schedule: Rounds, result: IterativeResult, seconds: float) -> str:
-    """What was run at an exposure, what it cost, how far its balls agree; one line, and one for each note."""
-    line = (
-        f"EV {request.ev:g}: {schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps, "
-        f"strength {schedule.strength:g}, seed {request.seeds[0]}; {result.evaluations} denoiser evaluations "
-        f"in {seconds:.1f} s; mean spread {float(result.spread.mean()):.3f}"
-    )
-    return "\n".join((line, *(f"EV {request.ev:g}: {note}" for note in result.notes)))

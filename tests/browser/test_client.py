@@ -17,7 +17,16 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
-WORKFLOWS = ("mini_quickstart", "paper_sdxl", "sdxl_fast", "base_only", "lora_only", "turbo")
+WORKFLOWS = (
+    "mini_quickstart",
+    "paper_sdxl",
+    "sdxl_fast",
+    "base_only",
+    "lora_only",
+    "turbo",
+    "spatially_varying",
+    "batch_folder",
+)
 
 DIALOGS = """[...document.querySelectorAll('[role=dialog], .comfy-modal')]
     .filter(element => element.offsetParent !== null).map(element => element.innerText)"""

@@ -73,7 +73,7 @@ def main() -> None:
     sampling = {"cfg": defaults.guidance, "sampler": "uni_pc", "scheduler": "leading (paper)"}
     sampling |= {"control_strength": defaults.control_scale, "batch_size": 4}
 
-    finished = pack_module("nodes.inpaint").FINISHED
+    finished = pack_module("nodes.painting").FINISHED
 
     def run() -> None:
         finished.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
@@ -107,6 +108,16 @@ def trained_graph(trained: Any) -> Graph:
     return graph_of(replace(trained, lora=None))
 
 
+@pytest.fixture(scope="session")
+def heeding_graph(trained_graph: Graph, mini: Any) -> Graph:
+    """Trained networks, since untrained ones paint nearly black balls, with a ControlNet that heeds the whole depth."""
+    awake = replace(mini, controlnet=deepcopy(mini.controlnet))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        awake.controlnet.controlnet_cond_embedding.conv_out.weight.normal_(std=3.0, generator=generator)
+    return replace(trained_graph, control_net=pack_module("nodes.mini").to_controlnet(awake))
+
+
 @dataclass(frozen=True)
 class Scene:
     """A small canvas with a ball: what Depth Ball Mask gives."""
@@ -165,4 +176,4 @@ def _no_gradients() -> Iterator[None]:
 def _no_finished_balls() -> None:
     """Every test starts with nothing painted, as after a start of ComfyUI."""
     if installed():
-        pack_module("nodes.inpaint").FINISHED.clear()
+        pack_module("nodes.painting").FINISHED.clear()

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from comfy_host import pack_module
+from counted_network import watched
 from torch.profiler import ProfilerActivity, profile
 
 PAINTING = {
@@ -41,28 +41,6 @@ def run(node: Nodes, graph: Any, scene: Any, **changes: Any) -> Any:
     return node("IterativeMedian").execute(**{**graph.sockets(), **places, **PAINTING, **ROUNDS, **changes}).args
 
 
-class CountedNetwork:
-    """Counts the pictures a network evaluates; it may be told to do something at one of them."""
-
-    def __init__(self, then: Callable[[int, int], None] = lambda count, batch: None) -> None:
-        self.count = 0
-        self._then = then
-
-    def __call__(self, module: Any, arguments: tuple[torch.Tensor, ...]) -> None:
-        self.count += len(arguments[0])
-        self._then(self.count, len(arguments[0]))
-
-
-@contextmanager
-def watched(graph: Any, then: Callable[[int, int], None] = lambda count, batch: None) -> Iterator[CountedNetwork]:
-    counted = CountedNetwork(then)
-    handle = graph.model.model.diffusion_model.register_forward_pre_hook(counted)
-    try:
-        yield counted
-    finally:
-        handle.remove()
-
-
 # --- interrupted and queued again --------------------------------------------------------------------------------
 
 
@@ -84,7 +62,7 @@ def test_it_goes_on_where_it_was_interrupted(node: Nodes, graph: Any, scene: Any
     """A batch is 2 balls, that is 4 pictures an evaluation and 8 in all; an interrupt costs the batch it falls into."""
     whole = run(node, graph, scene)
     assert whole[2].mean() > 0.01  # balls that differ, so that none can stand for another
-    pack_module("nodes.inpaint").FINISHED.clear()
+    pack_module("nodes.painting").FINISHED.clear()
     # Nothing is evaluated after the interrupt.
     assert at <= interrupted(node, graph, scene, at) < at + 4
     with watched(graph) as counted:
@@ -138,7 +116,7 @@ def test_more_balls_paint_only_the_ones_that_are_new(node: Nodes, graph: Any, sc
     with watched(graph) as counted:
         more = run(node, graph, scene, balls=6, **rounds)
     assert counted.count == 2 * BALL_COST
-    pack_module("nodes.inpaint").FINISHED.clear()
+    pack_module("nodes.painting").FINISHED.clear()
     assert torch.equal(more[1], run(node, graph, scene, balls=6, **rounds)[1])
 
 
@@ -151,7 +129,7 @@ def test_a_shortage_halves_the_batch_and_the_report_says_so(node: Nodes, graph: 
             raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
 
     whole = run(node, graph, scene)
-    pack_module("nodes.inpaint").FINISHED.clear()
+    pack_module("nodes.painting").FINISHED.clear()
     with watched(graph, short_of_memory):
         answer = run(node, graph, scene, batch_size=4)
     # The same batches of two, once the first of four has failed.
@@ -191,7 +169,7 @@ def test_the_batch_is_what_fits_in_free_memory(
 
 def test_an_automatic_batch_paints_the_same_balls(node: Nodes, graph: Any, scene: Any) -> None:
     one = run(node, graph, scene)
-    pack_module("nodes.inpaint").FINISHED.clear()
+    pack_module("nodes.painting").FINISHED.clear()
     # Order of summation in batched matrix products.
     torch.testing.assert_close(run(node, graph, scene, batch_size=0)[1], one[1], rtol=0, atol=1e-5)
 
@@ -219,7 +197,7 @@ def test_memory_grows_by_the_balls_alone(node: Nodes, graph: Any) -> None:
         return peak_bytes(lambda: node("IterativeMedian").execute(**{**sockets, **options, "balls": balls}))
 
     paint(4)  # weights are loaded once
-    pack_module("nodes.inpaint").FINISHED.clear()
+    pack_module("nodes.painting").FINISHED.clear()
     few, many = (paint(balls) for balls in (4, 16))
     # In a request's list, in the store, in the picture shown, and in the answer.
     assert many - few <= 4 * 12 * 16 * 16 * 3 * 4

@@ -29,6 +29,12 @@ SOCKETS = {
     "FitBall": ("balls photograph ball", "fit report"),
     "BallToEquirect": ("image ball fit", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),
+    "EstimateLight": (
+        "model clip vae control_net image depth depth_model",
+        "latlong hdr composite balls ball report",
+    ),
+    "BallGrid": ("image", "x y name"),
+    "LoadPhotoFolder": ("", "images names report"),
     "SaveEnvMap": ("latlong report", "path"),
     "LoadEnvMap": ("", "latlong"),
 }
@@ -99,6 +105,11 @@ def test_defaults_are_the_papers(schemas: dict[str, Any]) -> None:
     assert pack_module("nodes.sockets").parse_evs(steering["evs"]) == paper
     assert steering["ev_min"] == -5.0
     assert steering["lora_scale"] == 0.75
+    whole = {item.id: getattr(item, "default", None) for item in schemas["EstimateLight"].inputs}
+    shared = {*wanted, "evs", "ev_min", "prompt", "dark_prompt"}
+    assert {name: whole[name] for name in shared} == {name: (defaults | steering)[name] for name in shared}
+    assert whole["negative_prompt"] == pack_module("dl_core.prompts").NEGATIVE_PROMPT
+    assert (whole["preset"], whole["canvas"], whole["diameter"]) == ("balanced", 1024, 256)
     turbo = {item.id: getattr(item, "default", None) for item in schemas["TurboLoRASwap"].inputs}
     assert (turbo["turbo_scale"], turbo["exposure_scale"], turbo["timestep"]) == (1.0, 0.75, 800)
 
