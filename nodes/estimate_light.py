@@ -16,6 +16,7 @@ from ..dl_core.exposure import check_evs
 from ..dl_core.presets import PRESETS
 from ..dl_core.prompts import NEGATIVE_PROMPT
 from .depth_ball import depth_input, given, place_inputs
+from .doubts import doubts
 from .exposure import (
     bracket_conditionings,
     bracket_inputs,
@@ -89,6 +90,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                     "presets that reproduce their runs, paper and turbo, and ball with the others.",
                 ),
             ],
+            hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
                 named_output(io.Image, "latlong", "The map in linear radiance; white at EV 0 is 1."),
                 named_output(io.Image, "hdr", "The ball in linear radiance."),
@@ -138,7 +140,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         near = None if depth is None else one_picture(depth, "depth")
         probe = estimate(photo, painter, settings, depth=near, depth_of=depth_model, observer=observer)
         found = torch.cat([exposure.ball for exposure in probe.exposures])
-        report = _report(probe, painter.seconds)
+        report = "\n".join([_report(probe, painter.seconds), *doubts(cls.hidden, preset, options["model"])])
         return io.NodeOutput(probe.latlong_hdr, probe.ball_hdr, probe.composite_ldr, found, probe.ball, report)
 
 

@@ -17,6 +17,7 @@ from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ImageError
 from ..dl_core.iterative import iterative_inpaint, rounds_evaluations
 from ..dl_core.painter import PaintRequest
+from .doubts import doubts
 from .painter import ComfyPainter, Networks
 from .painting import (
     CUSTOM,
@@ -163,6 +164,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 # Last, so that saved workflows keep the order of their widgets.
                 depth_model_input("Without one all rounds use depth."),
             ],
+            hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
                 named_output(io.Image, "ball", "The answer, cut out, display-encoded."),
                 named_output(io.Image, "median", "The last median."),
@@ -198,6 +200,8 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         observer.expect(rounds_evaluations(painter, schedule))
         started = perf_counter()
         result = iterative_inpaint(painter, request, schedule, observer, depth_of=depth_model)
-        report = exposure_lines(ev, seed, schedule, result, perf_counter() - started)
+        lines = [exposure_lines(ev, seed, schedule, result, perf_counter() - started)]
+        if ev == 0:  # once a bracket
+            lines += doubts(cls.hidden, preset, options["model"])
         composite = paste_ball(request.canvas, result.ball, ball)
-        return io.NodeOutput(result.ball, result.median, result.spread, composite, report)
+        return io.NodeOutput(result.ball, result.median, result.spread, composite, "\n".join(lines))

@@ -22,7 +22,7 @@ from torch import Tensor
 from ..dl_core.lora import LoraSwap, LowRank, read_lora
 from .architecture import require_sdxl
 
-__all__ = ["read_lora_file", "with_lora", "with_lora_swap"]
+__all__ = ["read_lora_file", "swaps_loras", "with_lora", "with_lora_swap"]
 
 _KEY: Final = "lightprobe.lora_swap"
 Hook = Callable[[torch.nn.Module, tuple[Tensor, ...], Tensor], Tensor]
@@ -108,6 +108,11 @@ def with_lora_swap(model: Any, turbo: Mapping[str, Tensor], exposure: Mapping[st
     swapped.add_wrapper_with_key(WrappersMP.DIFFUSION_MODEL, _KEY, evaluate)
     swapped.add_callback_with_key(CallbacksMP.ON_CLEANUP, _KEY, release)
     return swapped
+
+
+def swaps_loras(model: Any) -> bool:
+    """Whether LoRAs take turns on a MODEL (`with_lora_swap`)."""
+    return bool(model.get_wrappers(WrappersMP.DIFFUSION_MODEL, _KEY))
 
 
 class _RuntimeLora:

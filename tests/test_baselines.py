@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dl_core.backends.mini import MiniModel
 from dl_core.ball import disc_mask, place_ball
-from dl_core.bench import baselines, regressor
+from dl_core.bench import baselines
 from dl_core.bench.baselines import BASELINES, answer_maps, open_baselines
 from dl_core.bench.cameras import Shot
 from dl_core.bench.paintings import planned
@@ -24,6 +24,7 @@ from dl_core.training.export import write_networks
 from dl_core.training.loop import Budget
 from dl_core.training.mean_light import mean_light, write_mean_light
 from dl_core.training.regressor import train_regressor
+from dl_core.training.regressor_painter import RegressorPainter
 from dl_core.training.scenes import SceneSampler
 
 SETTINGS = Settings(canvas=128, diameter=64, height=32, evs=(0.0, -2.5, -5.0))
@@ -92,7 +93,7 @@ def test_the_stretched_photograph_keeps_its_radiance() -> None:
 def test_the_regressor_gives_one_ball_whatever_the_seed_and_what_stood_there(
     folder: Path, request_: PaintRequest
 ) -> None:
-    painter = regressor.RegressorPainter(folder)
+    painter = RegressorPainter(folder)
     result = painter.paint(request_, SilentObserver())
     assert result.evaluations == painter.evaluations(2, 30, 1.0) == 2
     torch.testing.assert_close(result.balls[0], result.balls[1], atol=1e-5, rtol=0)

@@ -80,7 +80,7 @@ def _regressor(folder: Path | None, settings: Settings) -> Baseline:
     if folder is None:
         raise OptionError("--regressor", None, "the folder that `lightprobe train mini regressor` wrote")
     # Its networks take seconds to import.
-    from .regressor import RegressorPainter
+    from ..training.regressor_painter import RegressorPainter
 
     painter = RegressorPainter(folder)
     asked = replace(settings, rounds=Rounds(balls=1, rounds=0, steps=1, final=False))

@@ -1,4 +1,7 @@
-"""Where a socket's value comes from in the graph that is queued: what weights do not tell, file names often do."""
+"""Choices that run, but hardly give what was wanted: sentences for a report.
+
+What weights do not tell, the names of files in the queued graph often do.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,30 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-__all__ = ["control_net_doubt"]
+from .lora import swaps_loras
+
+__all__ = ["control_net_doubt", "doubts"]
 
 _KINDS: Final = (
     "canny", "hed", "softedge", "lineart", "scribble", "sketch", "mlsd", "openpose", "pose", "normal", "seg",
     "segmentation", "tile", "blur", "inpaint", "recolor", "shuffle", "ip2p", "qrcode",
 )  # fmt: skip
 """What ControlNets are trained to see, other than depth, as their files are named."""
+
+
+def doubts(hidden: Any, preset: str, model: Any) -> list[str]:
+    """What speaks against a preset and the models connected.
+
+    Args:
+        hidden: the node's hidden inputs, of them `prompt` and `unique_id`; None outside a queued graph.
+        preset: the one chosen.
+        model: the MODEL.
+    """
+    found = []
+    if preset == "turbo" and not swaps_loras(model):
+        found.append("preset turbo without Turbo LoRA Swap: each exposure is a single ball, as the noise has it")
+    queued = None if hidden is None or hidden.prompt is None else control_net_doubt(hidden.prompt, hidden.unique_id)
+    return [*found, *([queued] if queued else [])]
 
 
 def control_net_doubt(prompt: Mapping[str, Any], node: str) -> str | None:

@@ -12,8 +12,8 @@ from torch import Tensor
 from ..backends.diffusers_painter import DiffusersPainter
 from ..backends.mini import NETWORK_FILES, load_mini, load_network
 from ..painter import PaintRequest
-from ..training.denoiser import latent_disc, time_ids
-from ..training.regressor import visible
+from .denoiser import latent_disc, time_ids
+from .regressor import visible
 
 __all__ = ["RegressorPainter"]
 
@@ -21,7 +21,7 @@ TRAINED: Final = ("unet", "text_encoder", "text_encoder_2")
 
 
 class RegressorPainter(DiffusersPainter):
-    """Gives balls by regression. See `training.regressor`.
+    """Gives balls by regression. See `regressor`.
 
     Args:
         folder: holds the regressor's files, as its training wrote them; the autoencoder is the mini model's.
