@@ -5,12 +5,13 @@ ProbeError
 ├── ImageError       an image or map cannot be read, or holds what it must not (NaN, negative radiance)
 ├── ModelError       a model file is missing, or is not of the architecture asked for
 ├── OutputError      a result cannot be written where it was asked for
+├── ServerError      a ComfyUI server is away, or refuses what it is asked for
 └── Interrupted      the user stopped the run; what was finished is still usable
 """
 
 from __future__ import annotations
 
-__all__ = ["ImageError", "Interrupted", "ModelError", "OptionError", "OutputError", "ProbeError"]
+__all__ = ["ImageError", "Interrupted", "ModelError", "OptionError", "OutputError", "ProbeError", "ServerError"]
 
 
 class ProbeError(Exception):
@@ -54,6 +55,15 @@ class OutputError(ProbeError, OSError):
     def __init__(self, path: object, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
         self.path = path
+        self.reason = reason
+
+
+class ServerError(ProbeError):
+    """A ComfyUI server that is away or refuses something. `server` is its address."""
+
+    def __init__(self, server: str, reason: str) -> None:
+        super().__init__(f"{server}: {reason}")
+        self.server = server
         self.reason = reason
 
 

@@ -87,10 +87,11 @@ def pack_module(name: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class Server:
-    """A running ComfyUI server and the folder it works in."""
+    """A running ComfyUI server, the folder it works in and its process."""
 
     url: str
     base: Path
+    process: subprocess.Popen[bytes]
 
     def get(self, route: str, **query: str) -> bytes:
         """Body of a GET."""
@@ -166,30 +167,46 @@ def _fill_weights(folder: Path) -> None:
 @contextmanager
 def serve(base: Path) -> Iterator[Server]:
     """Run a ComfyUI server on a free port, working in `base`, with this pack and the package's photograph."""
+    prepare(base)
+    with launch(base, free_port()) as server:
+        yield server
+
+
+def prepare(base: Path) -> None:
+    """Make the folder of a server: this pack and the package's photograph in it."""
     (base / "input").mkdir(parents=True)
     shutil.copy(PHOTO, base / "input")
     install_pack(base / "custom_nodes")
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def launch(base: Path, port: int) -> Iterator[Server]:
+    """Run a ComfyUI server in a prepared folder. It may be killed and launched again, on the same port."""
     command = [sys.executable, "main.py", "--cpu", "--listen", "127.0.0.1", "--port", str(port)]
     command += ["--disable-auto-launch", "--base-directory", str(base)]
     command += ["--database-url", f"sqlite:///{base / 'comfyui.db'}"]
     environment = os.environ | {"PYTHONPATH": str(STANDIN), "PYTHONDONTWRITEBYTECODE": "1"}
-    with (base / "server.log").open("w") as log:
+    with (base / "server.log").open("a") as log:
         process = subprocess.Popen(command, cwd=COMFYUI, env=environment, stdout=log, stderr=log)
         try:
-            server = Server(f"http://127.0.0.1:{port}", base)
-            _wait_until_up(server, process)
+            server = Server(f"http://127.0.0.1:{port}", base, process)
+            _wait_until_up(server)
             yield server
         finally:
             process.terminate()
             process.wait(20)
 
 
-def _wait_until_up(server: Server, process: subprocess.Popen[bytes], timeout: float = 180) -> None:
+def _wait_until_up(server: Server, timeout: float = 180) -> None:
     deadline = time.monotonic() + timeout
-    while time.monotonic() < deadline and process.poll() is None:
+    while time.monotonic() < deadline and server.process.poll() is None:
         try:
             server.get("/system_stats")
             return
