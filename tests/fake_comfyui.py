@@ -10,6 +10,7 @@ import hashlib
 import json
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from email.message import Message
 from email.parser import BytesParser
@@ -22,7 +23,10 @@ MAGIC = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 
 def order(content: bytes) -> tuple[str, str]:
-    """What a photograph asks of the fake: `ok`, `slow SECONDS`, `break` (in a node), `refuse`, `partly`, `crash`."""
+    """What a photograph asks for.
+
+    `ok`; `slow SECONDS`; `break` in a node; `refuse` when queued; `partly` valid; `nothing` saved; `crash` the server.
+    """
     word, _, argument = content.decode().splitlines()[0].partition(" ")
     return word, argument
 
@@ -81,10 +85,8 @@ class FakeComfyUI:
         self._http.shutdown()
         self._http.server_close()
         for connection in [*self.connections]:
-            try:
+            with suppress(OSError):
                 connection.shutdown(2)
-            except OSError:
-                pass
 
     def forget(self) -> None:
         """Lose queue and history while staying up."""
@@ -123,6 +125,7 @@ class FakeComfyUI:
         self._say("progress", prompt_id=prompt_id, node="8", value=1, max=2)
         if word == "crash" and self.crashes_left > 0:
             self.crashes_left -= 1
+            time.sleep(0.3)  # what it said before is heard
             self.stop()
             self.start()
             return
@@ -264,11 +267,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.flush()
         self.server_state.sockets.append(self.connection)
-        try:
+        with suppress(OSError):
             while self.connection.recv(4096):
                 pass
-        except OSError:
-            pass
         self.close_connection = True
 
     def _answer(self, status: int, body: dict[str, Any]) -> None:

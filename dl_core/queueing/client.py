@@ -10,11 +10,11 @@ import json
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 import requests
@@ -137,16 +137,15 @@ class ComfyClient:
             ServerAway: no connection.
         """
         address = "ws" + self.url.removeprefix("http") + f"/ws?clientId={self.client_id}"
-        try:
-            # Previews can be larger than the library's limit for a message.
-            options: dict[str, Any] = {"open_timeout": TIMEOUTS[0], "close_timeout": 1, "max_size": None}
-            connection = cast("ClientConnection", connect(address, **options))
-        except (WebSocketException, OSError, EOFError) as error:
-            raise ServerAway(self.url, f"no websocket ({error})") from error
-        try:
+        with ExitStack() as stack:
+            try:
+                # Previews can be larger than the library's limit for a message.
+                connection = stack.enter_context(
+                    connect(address, open_timeout=TIMEOUTS[0], close_timeout=1, max_size=None)
+                )
+            except (WebSocketException, OSError, EOFError) as error:
+                raise ServerAway(self.url, f"no websocket ({error})") from error
             yield Events(self.url, connection)
-        finally:
-            connection.close()
 
     def upload(self, name: str, content: bytes) -> str:
         """Store a file in the server's input folder, in place of one of the same name; its name for Load Image.

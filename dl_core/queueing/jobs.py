@@ -19,6 +19,7 @@ __all__ = ["Run", "Servers", "plan_job", "run_jobs"]
 STOP_PATIENCE = 20.0
 """Seconds that servers get to cancel what they run."""
 GLANCE = 0.2
+"""Seconds between looks at whether threads have ended: on Windows a longer wait is deaf to Ctrl-C."""
 
 
 @dataclass(frozen=True)
@@ -110,31 +111,34 @@ class _Crew:
     """A thread for each server."""
 
     def __init__(self, workers: Sequence[Worker], pool: Pool) -> None:
-        self._pool = pool
+        self._workers, self._pool = workers, pool
         self._failures: list[BaseException] = []
-        self._threads = [threading.Thread(target=self._guarded, args=(worker,), daemon=True) for worker in workers]
+        # Threads say so themselves when they end: a join that Ctrl-C interrupts takes its thread for ended.
+        self._ended = [threading.Event() for _ in workers]
 
     def work(self) -> bool:
         """Until all are done; whether the user stopped them. A mistake in a thread is raised here."""
         interrupted = False
         try:
-            for thread in self._threads:
-                thread.start()
-            for thread in self._threads:
-                while thread.is_alive():
-                    thread.join(GLANCE)
+            for worker, ended in zip(self._workers, self._ended, strict=True):
+                threading.Thread(target=self._guarded, args=(worker, ended), daemon=True).start()
+            for ended in self._ended:
+                while not ended.wait(GLANCE):
+                    pass
         except KeyboardInterrupt:
             interrupted = True
             self._pool.stop()
-            for thread in self._threads:
-                thread.join(STOP_PATIENCE)
+            for ended in self._ended:
+                ended.wait(STOP_PATIENCE)
         if self._failures:
             raise self._failures[0]
         return interrupted
 
-    def _guarded(self, worker: Worker) -> None:
+    def _guarded(self, worker: Worker, ended: threading.Event) -> None:
         try:
             worker.run()
         except BaseException as failure:
             self._failures.append(failure)
             self._pool.stop()
+        finally:
+            ended.set()

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Literal, Protocol, runtime_checkable
 
 from .client import Fault
 from .ledger import Record
@@ -51,6 +51,7 @@ class Outcome:
     server: str | None = None
 
 
+@runtime_checkable
 class Watcher(Protocol):
     """Is told what happens, by several threads."""
 

@@ -6,6 +6,7 @@ import re
 import time
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from typing import Any, Final
@@ -23,6 +24,8 @@ TICK: Final = 0.5
 """Seconds between looks at whether the user stops the run or another server gave a job back."""
 LOOK: Final = 5.0
 """Seconds between looks into queue and history, should a message be missed."""
+LAST_WORDS: Final = 1.0
+"""Seconds without a message after which a server that went away has nothing more to say."""
 FIRST_WAIT: Final = 0.5
 LONGEST_WAIT: Final = 10.0
 """Seconds between attempts to reach a server that is away: doubled from the first to the longest."""
@@ -61,7 +64,7 @@ class Worker:
             while not self._pool.over.is_set():
                 try:
                     with self._client.events() as events:
-                        self._serve(events)
+                        self._serve_and_listen(events)
                 except ServerAway as away:
                     if not self._outlast(away):
                         return
@@ -70,6 +73,16 @@ class Worker:
             self._give_up(error.reason)
         finally:
             self._client.close()
+
+    def _serve_and_listen(self, events: Events) -> None:
+        """Serve; when the server goes away, hear what it still said: which job ran when it went."""
+        try:
+            self._serve(events)
+        except ServerAway:
+            with suppress(ServerAway):
+                while (message := events.next(LAST_WORDS)) is not None:
+                    self._hear(message["type"], message["data"])
+            raise
 
     def _serve(self, events: Events) -> None:
         """Follow the server's messages while it is there.
