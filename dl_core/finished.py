@@ -7,9 +7,10 @@ painting would give again.
 from __future__ import annotations
 
 import hashlib
+import mmap
 import threading
 import uuid
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, Final
@@ -25,18 +26,24 @@ __all__ = ["FinishedBalls", "content_key"]
 
 
 class FinishedBalls:
-    """A store of balls, bounded in bytes; the one longest unused goes first."""
+    """A store of balls, bounded in bytes and in keys; the one longest unused goes first.
 
-    def __init__(self, limit: int) -> None:
-        """Keep up to `limit` bytes.
+    Threads may share it.
+    """
+
+    def __init__(self, limit: int, keys: int | None = None) -> None:
+        """Keep up to `limit` bytes, and balls of up to `keys` keys where that is given.
 
         Raises:
-            OptionError: a negative limit.
+            OptionError: a negative limit, or less than one key.
         """
         if limit < 0:
             raise OptionError("limit", limit, "0 or more bytes")
-        self._limit, self._held = limit, 0
-        self._balls: OrderedDict[tuple[str, int], Tensor] = OrderedDict()
+        if keys is not None and keys < 1:
+            raise OptionError("keys", keys, "1 or more")
+        self._limit, self._held, self._keys = limit, 0, keys
+        self._balls_of: Counter[str] = Counter()
+        self._balls: OrderedDict[tuple[str, int], _Kept] = OrderedDict()
         self._lock = threading.Lock()
 
     @property
@@ -47,7 +54,7 @@ class FinishedBalls:
     def find(self, key: str, seeds: tuple[int, ...]) -> dict[int, BallImage]:
         """Those balls of a key that are there, (1, D, D, 3) each, by seed."""
         with self._lock:
-            found = {seed: self._balls[key, seed] for seed in seeds if (key, seed) in self._balls}
+            found = {seed: self._balls[key, seed].tensor() for seed in seeds if (key, seed) in self._balls}
             for seed in found:
                 self._balls.move_to_end((key, seed))
         return found
@@ -57,21 +64,47 @@ class FinishedBalls:
         with self._lock:
             for seed, ball in zip(seeds, balls.detach().split(1), strict=True):
                 self._drop((key, seed))
-                # A copy, since a slice would keep the whole batch alive.
-                self._balls[key, seed] = ball.to("cpu", copy=True)
+                self._balls[key, seed] = _Kept(ball)
                 self._held += ball.nbytes
-            while self._held > self._limit:
+                self._balls_of[key] += 1
+            while self._held > self._limit or (self._keys is not None and len(self._balls_of) > self._keys):
                 self._drop(next(iter(self._balls)))
 
     def clear(self) -> None:
         """Forget all."""
         with self._lock:
             self._balls.clear()
+            self._balls_of.clear()
             self._held = 0
 
     def _drop(self, name: tuple[str, int]) -> None:
         dropped = self._balls.pop(name, None)
-        self._held -= 0 if dropped is None else dropped.nbytes
+        if dropped is None:
+            return
+        self._held -= dropped.size
+        self._balls_of[name[0]] -= 1
+        if not self._balls_of[name[0]]:
+            del self._balls_of[name[0]]
+
+
+class _Kept:
+    """A ball in pages of its own, which go back to the system with it.
+
+    Not a tensor, since even the head of one is a piece of the heap: in glibc before 2.38 a piece that stays where a
+    painting's large buffers were keeps the next ones from being put there again, and a server's memory grows by all of
+    them with every run.
+    """
+
+    __slots__ = ("_dtype", "_pages", "_shape", "size")
+
+    def __init__(self, ball: Tensor) -> None:
+        self._shape, self._dtype, self.size = tuple(ball.shape), ball.dtype, ball.nbytes
+        self._pages = mmap.mmap(-1, ball.nbytes)
+        self.tensor().copy_(ball)
+
+    def tensor(self) -> Tensor:
+        """The ball, in main memory; it holds the pages as long as it is used."""
+        return torch.frombuffer(self._pages, dtype=self._dtype).view(self._shape)
 
 
 def content_key(*values: Any) -> str:

@@ -38,9 +38,11 @@ __all__ = [
 CUSTOM: Final = "custom"
 """Preset that leaves the node's own values in force."""
 
-FINISHED: Final = FinishedBalls(256 * 2**20)
+FINISHED: Final = FinishedBalls(256 * 2**20, keys=64)
 """Balls of the runs before, so that a graph queued again after an interrupt goes on where it was: 256 MiB hold those of
-five exposures of the paper's schedule, 61 balls each at 256 pixels."""
+five exposures of the paper's schedule, 61 balls each at 256 pixels. Each round of each exposure is a key: 64 hold the
+last 21 runs of the quickstart or the last four of that schedule, so that a server which runs one photograph after
+another does not fill up with balls that nobody asks for again."""
 
 
 # --- widgets -----------------------------------------------------------------------------------------------------

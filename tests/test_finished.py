@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -60,9 +63,53 @@ def test_cleared_it_holds_nothing() -> None:
     assert (store.bytes_held, store.find("key", (1,))) == (0, {})
 
 
-def test_a_negative_limit_is_refused() -> None:
-    with pytest.raises(OptionError, match="limit is -1"):
-        FinishedBalls(-1)
+def test_balls_of_the_key_longest_unused_go_when_there_are_too_many_keys() -> None:
+    store = FinishedBalls(10**6, keys=2)
+    store.keep("a", (1, 2), balls(1, 2))
+    store.keep("b", (1, 2, 3), balls(1, 2, 3))
+    assert set(store.find("a", (1, 2))) == {1, 2}
+    store.keep("c", (1,), balls(1))
+    assert [len(store.find(key, (1, 2, 3))) for key in "abc"] == [2, 0, 1]
+    assert store.bytes_held == 3 * BALL_BYTES
+    store.keep("c", (1,), balls(4))  # the same ball again is no more of them
+    store.keep("d", (1,), balls(1))
+    assert [len(store.find(key, (1, 2, 3))) for key in "acd"] == [0, 1, 1]
+
+
+HEAP = """
+import torch
+from dl_core.finished import FinishedBalls
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+
+store = FinishedBalls(2**30)
+for run in range(60):
+    buffers = [torch.ones(27 * 2**18), torch.ones(27 * 2**18)]
+    balls = torch.ones(3, 64, 64, 3)
+    buffers.append(torch.ones(9 * 2**18))
+    del buffers[0]
+    store.keep(str(run), (0, 1, 2), balls)
+    del buffers, balls
+    if run == 19:
+        warm = resident() - store.bytes_held
+print(resident() - store.bytes_held - warm)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_what_is_kept_does_not_keep_the_memory_of_its_painting() -> None:
+    """40 runs with buffers of 63 MiB, of which each keeps 144 KiB: what else stays is less than one run's buffers."""
+    answer = subprocess.run(
+        [sys.executable, "-c", HEAP], cwd=Path(__file__).parent.parent, capture_output=True, text=True, check=True
+    )
+    assert int(answer.stdout) < 63 * 2**20
+
+
+@pytest.mark.parametrize(("options", "name"), [((-1,), "limit"), ((5, 0), "keys")])
+def test_limits_that_are_none_are_refused(options: tuple[int, ...], name: str) -> None:
+    with pytest.raises(OptionError, match=f"{name} is {options[-1]}"):
+        FinishedBalls(*options)
 
 
 # --- keys --------------------------------------------------------------------------------------------------------
