@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import copy
+import http.server
 import json
 import os
 import signal
-import socket
+import socketserver
 import subprocess
 import sys
 import threading
@@ -87,12 +88,6 @@ def queue(workflow: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 
 def statuses(report: dict[str, Any]) -> list[str]:
     return [row["status"] for row in report["photos"]]
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 # --- workflows ---------------------------------------------------------------------------------------------------
@@ -433,6 +428,21 @@ def test_without_any_server_jobs_fail_with_the_reason(server: FakeComfyUI, photo
     assert (code, statuses(report)) == (1, ["failed", "failed"])
     message = report["photos"][0]["errors"][0]["message"]
     assert message.startswith(f"no server left: {server.url} stayed away for 1 s, ")
+
+
+def test_what_is_no_comfyui_server_is_given_up_at_once(
+    second: FakeComfyUI, photo: Photo, queue: Queue, tmp_path: Path
+) -> None:
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), http.server.SimpleHTTPRequestHandler) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{other.server_address[1]}"
+        code, report = queue([photo("a.jpg")], [second], "--server", address)
+        assert (code, report["photos"][0]["server"]) == (0, second.url)
+        code, report = queue([photo("b.jpg")], [], "--server", address, "--timeout", "50")
+        other.shutdown()
+    assert (code, report["photos"][0]["status"]) == (1, "failed")
+    assert report["photos"][0]["errors"][0]["message"].startswith(f"no server left: {address} /queue: 404")
+    assert report["seconds"] < 10
 
 
 # --- stopped by the user -----------------------------------------------------------------------------------------

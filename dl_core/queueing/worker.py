@@ -63,6 +63,7 @@ class Worker:
         try:
             while not self._pool.over.is_set():
                 try:
+                    self._client.queue()  # what is no ComfyUI server is found out here, and not waited for
                     with self._client.events() as events:
                         self._serve_and_listen(events)
                 except ServerAway as away:

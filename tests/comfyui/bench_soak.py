@@ -14,6 +14,8 @@ from __future__ import annotations
 import argparse
 import copy
 import json
+import platform
+import shutil
 import signal
 import sys
 import tempfile
@@ -28,6 +30,7 @@ from typing import Any
 sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
 
 import psutil  # noqa: E402  comes with ComfyUI
+import torch  # noqa: E402
 from comfy_host import PHOTO, REPOSITORY, free_port, launch, prepare  # noqa: E402
 from PIL import Image  # noqa: E402
 
@@ -161,6 +164,8 @@ def faults(run: Run, known: list[Outcome], bad: dict[str, Bad], memory: dict[str
     """What is not as it has to be."""
     found = ["it was stopped before the end"] if run.interrupted else []
     for outcome in (*run.outcomes, *known):
+        if outcome.status == "cancelled":
+            continue
         photo = outcome.job.photo.name
         wanted = bad.get(photo)
         if wanted is None and outcome.status not in ("done", "skipped"):
@@ -176,6 +181,12 @@ def faults(run: Run, known: list[Outcome], bad: dict[str, Bad], memory: dict[str
     elif memory["growth"] > GROWTH:
         found.append(f"memory grew by {memory['growth']:.1%}")
     return found
+
+
+def environment() -> dict[str, str]:
+    """What memory depends on: how glibc gives it back differs between versions."""
+    libc = " ".join(platform.libc_ver())
+    return {"python": platform.python_version(), "torch": torch.__version__, "libc": libc, "system": platform.system()}
 
 
 def main() -> int:
@@ -203,11 +214,13 @@ def main() -> int:
             alarm.start()
             run = run_jobs(jobs, Servers((server.url,)), ledger, readings)
             alarm.cancel()
+        shutil.copy(base / "server.log", args.out)
     memory = growth(readings.rows)
     found = faults(run, known, bad, memory)
     outcomes = [*run.outcomes, *known]
     maps = sum(file.suffix == ".exr" and file.is_file() for outcome in outcomes for file in outcome.files)
-    report = {"jobs": args.jobs, "bad": args.bad, "maps": maps, "faults": found, **memory, "rows": readings.rows}
+    report = {"jobs": args.jobs, "bad": args.bad, "maps": maps, "faults": found, **memory}
+    report |= {"environment": environment(), "rows": readings.rows}
     with atomic(args.out / "soak.json") as temporary:
         temporary.write_text(json.dumps(report, indent=2), encoding="utf-8")
     failed = sum(outcome.status == "failed" for outcome in outcomes)
