@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import signal
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -94,6 +96,21 @@ def test_a_server_killed_in_the_middle_is_waited_for(tmp_path: Path, capsys: pyt
     ((code, report),) = answers
     assert (code, report["photos"][0]["status"]) == (0, "done")
     assert read_envmap(tmp_path / "out" / f"{PHOTO.stem}.exr").shape == (1, 64, 128, 3)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals as on Unix")
+def test_ctrl_c_leaves_the_server_idle(server: Server, tmp_path: Path) -> None:
+    """One job runs and one waits when the interrupt comes; the paper's schedule would take minutes."""
+    flow, other = small(tmp_path / "flow.json", preset="paper", batch_size=1), tmp_path / "other.jpg"
+    other.write_bytes(PHOTO.read_bytes() + b" ")
+    command = [sys.executable, "-c", "import sys; from dl_core.cli import main; sys.exit(main(sys.argv[1:]))"]
+    command += ["queue", str(flow), str(PHOTO), str(other), "--server", server.url, "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, cwd=REPOSITORY)
+    wait_until(lambda: all(server.get_json("/queue").values()))
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 130
+    state = server.get_json("/queue")
+    assert (state["queue_running"], state["queue_pending"]) == ([], [])
 
 
 def wait_until(condition: Any, timeout: float = 60) -> None:
