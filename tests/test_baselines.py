@@ -9,15 +9,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from dl_core.backends import mini
 from dl_core.backends.mini import MiniModel
 from dl_core.ball import disc_mask, place_ball
-from dl_core.bench import baselines
 from dl_core.bench.baselines import BASELINES, answer_maps, open_baselines
 from dl_core.bench.cameras import Shot
 from dl_core.bench.paintings import planned
+from dl_core.bench.perfect import PerfectPainter, RoundTripPainter
 from dl_core.errors import ModelError, OptionError
 from dl_core.estimate import Settings
 from dl_core.exposure import encode_display
+from dl_core.geometry import ball_coverage
 from dl_core.imageio import read_envmap, read_exr_header, write_exr
 from dl_core.painter import PaintRequest, SilentObserver
 from dl_core.training.export import write_networks
@@ -124,7 +126,7 @@ def test_answers_are_written_once_with_their_cost(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_mean_light(tmp_path, torch.full((1, 32, 64, 3), 0.5), 1)
-    monkeypatch.setattr(baselines, "MINI_FOLDER", tmp_path)
+    monkeypatch.setattr(mini, "MINI_FOLDER", tmp_path)
     scene = write_exr(tmp_path / "scene.exr", torch.rand(32, 64, 3) + 0.1, metadata={})
     opened = open_baselines(list(BASELINES), folder, replace(SETTINGS, canvas=256, diameter=128))
     asked = list(planned([scene], "three-spheres", list(BASELINES), 0))
@@ -133,9 +135,21 @@ def test_answers_are_written_once_with_their_cost(
         answer_maps(asked, opened, tmp_path / "out", report=said.append)
     assert len(said) == len(BASELINES)
     costs = {item.variant: int(read_exr_header(item.map_in(tmp_path / "out"))["lightprobe:nfe"]) for item in asked}
-    assert costs == {"mean": 0, "stretched": 0, "regressor": 3}
-    assert torch.equal(read_envmap(asked[0].map_in(tmp_path / "out")), torch.full((1, 32, 64, 3), 0.5))
+    assert costs == {"vae-floor": 0, "mean": 0, "stretched": 0, "regressor": 3}
+    maps = {item.variant: read_envmap(item.map_in(tmp_path / "out")) for item in asked}
+    assert torch.equal(maps["mean"], torch.full((1, 32, 64, 3), 0.5))
     assert read_envmap(asked[0].truth_in(tmp_path / "out")).shape == (1, 32, 64, 3)
+
+
+def test_a_round_trip_without_loss_is_the_truth(request_: PaintRequest) -> None:
+    truth = PerfectPainter(LEVEL.expand(1, 32, 64, 3))
+    expected = truth.paint(request_, SilentObserver()).balls
+    found = RoundTripPainter(truth, lambda canvas: canvas).paint(request_, SilentObserver())
+    inside = ball_coverage(64)[..., None] == 1
+    torch.testing.assert_close(found.balls * inside, expected * inside)
+    assert (found.evaluations, len(found.balls)) == (0, 2)
+    halved = RoundTripPainter(truth, lambda canvas: canvas / 2).paint(request_, SilentObserver()).balls
+    torch.testing.assert_close(halved * inside, expected * inside / 2)
 
 
 def test_a_regressor_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -1,25 +1,27 @@
-"""Answers that no diffusion model gives: what a method has to be better than to be worth its cost."""
+"""Answers that no diffusion model gives: what a method has to be better than, and the floor it cannot get under."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import torch
 import torch.nn.functional as F
 
-from ..backends.mini import MINI_FOLDER
 from ..errors import OptionError
 from ..estimate import Settings, estimate
 from ..exposure import decode_display
 from ..imageio import read_envmap, write_exr
 from ..iterative import Rounds
+from ..painter import Painter
 from ..resize import resize_latlong
-from ..shapes import Latlong
+from ..shapes import Image, Latlong
 from ..training.mean_light import MEAN_FILE
 from .cameras import Shot, take
 from .paintings import Painting
+from .perfect import PerfectPainter, RoundTripPainter
 
 __all__ = ["BASELINES", "Answer", "answer_maps", "open_baselines"]
 
@@ -35,6 +37,7 @@ class Answer:
 Baseline = Callable[[Shot], Answer]
 
 BASELINES: Final[dict[str, str]] = {
+    "vae-floor": "true balls through the mini model's autoencoder",
     "mean": "mean of all training light",
     "stretched": "photograph stretched over the sphere",
     "regressor": "regressor, as many parameters",
@@ -56,6 +59,7 @@ def open_baselines(names: Sequence[str], regressor: Path | None, settings: Setti
         ImageError: the mean light cannot be read.
     """
     make = {
+        "vae-floor": lambda: _floor(settings),
         "mean": lambda: _mean(settings),
         "stretched": lambda: lambda shot: Answer(_stretched(shot, settings)),
         "regressor": lambda: _regressor(regressor, settings),
@@ -63,9 +67,33 @@ def open_baselines(names: Sequence[str], regressor: Path | None, settings: Setti
     return {name: make[name]() for name in names}
 
 
+# Networks take seconds to import, so only the baseline that wants them does.
+
+
 def _mean(settings: Settings) -> Baseline:
+    from ..backends.mini import MINI_FOLDER
+
     light = resize_latlong(read_envmap(MINI_FOLDER / MEAN_FILE), settings.height)
     return lambda shot: Answer(light)
+
+
+def _floor(settings: Settings) -> Baseline:
+    from ..backends.mini import load_mini
+
+    vae: Any = load_mini(without=("unet", "controlnet", "text_encoder", "text_encoder_2")).vae
+
+    @torch.no_grad()
+    def code(canvas: Image) -> Image:
+        latents = vae.encode(canvas.permute(0, 3, 1, 2) * 2 - 1).latents
+        return (vae.decode(latents).sample / 2 + 0.5).permute(0, 2, 3, 1)
+
+    return lambda shot: _one_pass(shot, RoundTripPainter(PerfectPainter(shot.truth_hdr), code), settings)
+
+
+def _one_pass(shot: Shot, painter: Painter, settings: Settings) -> Answer:
+    """What a painter that needs no second ball makes of a photograph."""
+    probe = estimate(shot.photo_ldr, painter, replace(settings, rounds=Rounds(balls=1, rounds=0, steps=1, final=False)))
+    return Answer(probe.latlong_hdr, probe.evaluations)
 
 
 def _stretched(shot: Shot, settings: Settings) -> Latlong:
@@ -79,17 +107,10 @@ def _stretched(shot: Shot, settings: Settings) -> Latlong:
 def _regressor(folder: Path | None, settings: Settings) -> Baseline:
     if folder is None:
         raise OptionError("--regressor", None, "the folder that `lightprobe train mini regressor` wrote")
-    # Its networks take seconds to import.
     from ..training.regressor_painter import RegressorPainter
 
     painter = RegressorPainter(folder)
-    asked = replace(settings, rounds=Rounds(balls=1, rounds=0, steps=1, final=False))
-
-    def answer(shot: Shot) -> Answer:
-        probe = estimate(shot.photo_ldr, painter, asked)
-        return Answer(probe.latlong_hdr, probe.evaluations)
-
-    return answer
+    return lambda shot: _one_pass(shot, painter, settings)
 
 
 def answer_maps(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Final
 
+from ..ball import crop_ball, paste_ball
 from ..exposure import expose, quantize
 from ..geometry import latlong_to_ball
-from ..painter import Observer, PaintRequest, PaintResult, first_step
-from ..shapes import BallImage, Latlong
+from ..painter import Observer, PaintRequest, PaintResult, SilentObserver, first_step
+from ..shapes import BallImage, Image, Latlong
 
-__all__ = ["PerfectPainter"]
+__all__ = ["PerfectPainter", "RoundTripPainter"]
 
 _GUIDED: Final = 2
 """Denoiser evaluations a step, as with classifier-free guidance."""
@@ -40,3 +42,27 @@ class PerfectPainter:
         spent = self.evaluations(len(request.seeds), request.steps, request.strength)
         observer.evaluated(spent)
         return PaintResult(painted.expand(len(request.seeds), -1, -1, -1), spent)
+
+
+@dataclass
+class RoundTripPainter:
+    """Paints the true ball as an autoencoder gives it back: the floor of what a model with this autoencoder can reach.
+
+    Attributes:
+        truth: paints the true ball.
+        code: (B, S, S, 3) display-encoded -> the same, encoded and decoded.
+    """
+
+    truth: PerfectPainter
+    code: Callable[[Image], Image]
+
+    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+        """None: no denoiser is asked."""
+        return 0
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        """See `painter.Painter`."""
+        one = self.truth.paint(replace(request, seeds=request.seeds[:1]), SilentObserver())
+        canvas = paste_ball(request.canvas, one.balls, request.ball)
+        ball = crop_ball(self.code(canvas).clamp(0, 1), request.ball)
+        return PaintResult(ball.expand(len(request.seeds), -1, -1, -1), 0)
