@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 from fake_comfyui import FakeComfyUI
+from foreground import hear_ctrl_c
 
 from dl_core import cli
 from dl_core.errors import OptionError
@@ -462,7 +463,9 @@ def test_an_interrupt_cancels_our_jobs_and_keeps_what_was_collected(
     server.inputs["theirs.jpg"] = b"ok"
     command = [sys.executable, "-c", "import sys; from dl_core.cli import main; sys.exit(main(sys.argv[1:]))"]
     command += ["queue", str(workflow), *map(str, photos), "--server", server.url, "--out", str(tmp_path / "out")]
-    process = subprocess.Popen([*command, "--json"], cwd=ROOT, stdout=subprocess.PIPE, env=os.environ | {"CI": ""})
+    process = subprocess.Popen(
+        [*command, "--json"], cwd=ROOT, stdout=subprocess.PIPE, env=os.environ | {"CI": ""}, preexec_fn=hear_ctrl_c
+    )
     server.wait_until(lambda: len(server.log.started) == 2 and len(server.pending) == 1, 60)
     theirs = copy.deepcopy(PROMPT)
     theirs["2"]["inputs"]["image"] = "theirs.jpg"
