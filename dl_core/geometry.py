@@ -322,6 +322,7 @@ def latlong_to_ball(
     radius: float | None = None,
     centre: tuple[float, float] | None = None,
     projection: Projection = ORTHOGRAPHIC,
+    rotation: Float[Tensor, "3 3"] | None = None,
     samples: int | None = None,
 ) -> BallImage:
     """The mirror ball that a camera sees in the light of a map.
@@ -332,6 +333,7 @@ def latlong_to_ball(
         radius: of the ball in pixels; half the crop when not given.
         centre: (x, y) of the ball in the crop, in pixels from its top-left corner; the middle when not given.
         projection: of the camera.
+        rotation: camera to world, as from `camera_rotation`; straight ahead when not given.
         samples: samples along each side of a pixel at the centre, up to four times as many near the rim; when not
             given, as many as keep the energy of a light one map pixel wide within 0.3%. Those of a rim pixel that
             miss the ball do not count.
@@ -349,6 +351,7 @@ def latlong_to_ball(
     samples = _ball_samples(latlong.shape[1], radius) if samples is None else samples
     _require_samples(samples)
     lens = projection.lens(radius, centre, size)
+    camera = (torch.eye(3) if rotation is None else rotation).to(latlong)
     x, y = torch.meshgrid(*[torch.arange(size, device=latlong.device, dtype=torch.float32)] * 2, indexing="xy")
     corners = torch.stack((x - centre[0], centre[1] - y), dim=-1).reshape(-1, 2)
     length = torch.linalg.norm(corners + corners.new_tensor([0.5, -0.5]), dim=-1) / radius
@@ -356,9 +359,11 @@ def latlong_to_ball(
     total = latlong.new_zeros(latlong.shape[0], size * size, latlong.shape[3] + 1)
     for inner, outer, detail in _RINGS:
         ring = torch.nonzero((length >= inner) & (length < outer)).squeeze(1)
-        total[:, ring] = _sum_ball_pixels(latlong, corners[ring], radius, lens, min(64, round(detail * samples)))
+        total[:, ring] = _sum_ball_pixels(
+            latlong, corners[ring], radius, lens, camera, min(64, round(detail * samples))
+        )
     if lens.equal_area:
-        _add_rim(total, latlong, radius, centre)
+        _add_rim(total, latlong, radius, centre, camera)
     return (total[..., :-1] / total[..., -1:].clamp(min=1e-9)).unflatten(1, (size, size))
 
 
@@ -377,7 +382,12 @@ There the ball's pixels are wedges of up to 14 degrees, and no even grid in a pi
 
 
 def _sum_ball_pixels(
-    latlong: Latlong, corners: Float[Tensor, "n 2"], radius: float, lens: Lens, samples: int
+    latlong: Latlong,
+    corners: Float[Tensor, "n 2"],
+    radius: float,
+    lens: Lens,
+    camera: Float[Tensor, "3 3"],
+    samples: int,
 ) -> Float[Tensor, "b n k"]:
     """Radiance summed over the part on the ball of each of n pixels, and the area of that part, in pixels.
 
@@ -386,6 +396,7 @@ def _sum_ball_pixels(
         corners: upper left corners, in pixels from the ball's centre, y up.
         radius: of the ball in pixels.
         lens: of the camera; of an orthographic one the rim is left to `_add_rim`.
+        camera: camera to world.
         samples: along each side of a pixel.
     """
     step = _subpixels(1, samples, latlong.device)
@@ -396,13 +407,19 @@ def _sum_ball_pixels(
         disc = (batch[:, None] + offsets) / radius
         on_ball = disc.square().sum(-1) < math.cos(_RIM / 2) ** 2 if lens.equal_area else lens.on_ball(disc)
         share = (on_ball.to(latlong) / samples**2)[..., None]
-        values = sample_latlong(latlong, lens.reflect(disc))
+        values = sample_latlong(latlong, lens.reflect(disc) @ camera.T)
         area = share.sum(dim=1).expand(len(values), -1, -1)
         batches.append(torch.cat(((values * share).sum(dim=2), area), dim=-1))
     return torch.cat(batches, dim=1)
 
 
-def _add_rim(total: Float[Tensor, "b n k"], latlong: Latlong, radius: float, centre: tuple[float, float]) -> None:
+def _add_rim(
+    total: Float[Tensor, "b n k"],
+    latlong: Latlong,
+    radius: float,
+    centre: tuple[float, float],
+    camera: Float[Tensor, "3 3"],
+) -> None:
     """Add the rim of an orthographic ball to sums over pixels: rings about straight ahead, three to a map pixel."""
     size = math.isqrt(total.shape[1])
     rings = max(16, math.ceil(3 * latlong.shape[1] * _RIM / math.pi), math.ceil(radius / 2))
@@ -421,7 +438,7 @@ def _add_rim(total: Float[Tensor, "b n k"], latlong: Latlong, radius: float, cen
         distance = radius * torch.cos(ring / 2)[:, None]
         column, row = (centre[0] + distance * x).floor().long(), (centre[1] - distance * y).floor().long()
         on_crop = ((column >= 0) & (column < size) & (row >= 0) & (row < size)).flatten()
-        values = sample_latlong(latlong, directions[on_crop])
+        values = sample_latlong(latlong, directions[on_crop] @ camera.T)
         weight = ring_areas[:, None].expand_as(x).flatten()[on_crop, None]
         values = torch.cat((values * weight, weight.expand(len(values), -1, -1)), dim=-1)
         total.index_add_(1, (row * size + column).flatten()[on_crop], values)

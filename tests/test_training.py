@@ -12,12 +12,16 @@ from pathlib import Path
 import pytest
 import torch
 from diffusers import AutoencoderTiny
+from hypothesis import given
+from hypothesis import strategies as st
+from tolerances import assert_close
 from torch import Tensor, nn
 
 from dl_core.backends.diffusers_painter import DiffusersPainter
 from dl_core.backends.mini import MiniModel
 from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
+from dl_core.geometry import latlong_energy
 from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
 from dl_core.training.control import train_control
 from dl_core.training.decoder import train_decoder
@@ -245,9 +249,15 @@ def test_a_work_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     assert raised.value.name == "--work"
 
 
-def test_reducing_keeps_the_mean() -> None:
-    latlong = torch.rand(1, 32, 64, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(reduce_panorama(latlong, 8).mean(), latlong.mean())
+@given(rows=st.integers(1, 32), seed=st.integers(0, 99))
+def test_reducing_keeps_the_energy(rows: int, seed: int) -> None:
+    latlong = torch.rand(1, 32, 64, 3, generator=torch.Generator().manual_seed(seed)) ** 8
+    assert_close(latlong_energy(reduce_panorama(latlong, rows)), latlong_energy(latlong))
+
+
+def test_reducing_by_whole_blocks_averages_them() -> None:
+    columns = torch.rand(1, 1, 64, 3, generator=torch.Generator().manual_seed(0)).expand(-1, 32, -1, -1)
+    assert_close(reduce_panorama(columns, 8), columns.unflatten(2, (16, 4)).mean(dim=3)[:, :8])
 
 
 @pytest.mark.parametrize("seed", range(6))

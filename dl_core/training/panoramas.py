@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,7 +18,9 @@ from ..imageio import read_envmap, require_writable, write_exr
 from ..shapes import Latlong
 from .procedural import draw_panorama
 
-__all__ = ["KINDS", "draw_scenes", "load_panoramas", "panorama_files", "reduce_panorama"]
+__all__ = ["KINDS", "draw_scenes", "find_panoramas", "load_panoramas", "panorama_files", "reduce_panorama"]
+
+SUFFIXES: Final = (".exr", ".hdr")
 
 
 def _render(seed: int, height: int) -> Latlong:
@@ -35,29 +38,93 @@ def panorama_files(folder: Path, split: str) -> list[Path]:
     """Files of one split of a folder whose `manifest.json` lists {"file", "split"}, in the manifest's order.
 
     Raises:
-        OptionError: no manifest, or nothing in it of that split.
+        OptionError: no manifest, one that is none, or nothing in it of that split.
     """
+    manifest = folder / "manifest.json"
     try:
-        entries = json.loads((folder / "manifest.json").read_text())
+        entries = [(str(entry["file"]), str(entry["split"])) for entry in json.loads(manifest.read_text())]
     except OSError as error:
         raise OptionError("panoramas", str(folder), "a folder of HDR maps with a manifest.json") from error
-    files = [folder / entry["file"] for entry in entries if entry["split"] == split]
+    except (ValueError, TypeError, KeyError) as error:
+        raise OptionError("manifest", str(manifest), 'a JSON list of {"file": ..., "split": ...}') from error
+    files = [folder / file for file, of in entries if of == split]
     if not files:
-        splits = sorted({entry["split"] for entry in entries})
-        raise OptionError("split", split, "one the manifest has: " + ", ".join(splits))
+        raise OptionError("split", split, "one the manifest has: " + ", ".join(sorted({of for _, of in entries})))
     return files
 
 
-def reduce_panorama(latlong: Latlong, height: int) -> Float[Tensor, "b rows cols c"]:
-    """Average a map down to `height` rows, a divisor of its own.
+def find_panoramas(folders: Sequence[Path], split: str | None) -> dict[str, Path]:
+    """HDR maps of folders by name, sorted by it.
+
+    Args:
+        folders: with a `manifest.json` of splits, or any other folders of .exr and .hdr files.
+        split: of the manifests. When not given, `training` where there is a manifest, and all files elsewhere.
+
+    Returns:
+        Files by their name; where two have the same one, by as much of the path as tells them apart.
 
     Raises:
-        ImageError: the map has fewer rows, or not a multiple.
+        OptionError: a folder without maps, or without a manifest though a split is asked for.
     """
-    factor, rest = divmod(latlong.shape[1], height)
-    if factor < 1 or rest:
-        raise ImageError("panorama", f"has {latlong.shape[1]} rows, a multiple of {height} is accepted")
-    return F.avg_pool2d(latlong.permute(0, 3, 1, 2), factor).permute(0, 2, 3, 1)
+    files = {path.resolve(): None for folder in folders for path in _maps_in(folder, split)}
+    return dict(sorted(zip(_distinct_names(list(files)), files, strict=True)))
+
+
+def _maps_in(folder: Path, split: str | None) -> list[Path]:
+    if split is not None or (folder / "manifest.json").is_file():
+        return panorama_files(folder, split or "training")
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    except OSError as error:
+        raise OptionError("panoramas", str(folder), "a folder of .exr or .hdr maps") from error
+    if not files:
+        raise OptionError("panoramas", str(folder), "a folder of .exr or .hdr maps; this one holds none")
+    return files
+
+
+def _distinct_names(paths: list[Path]) -> list[str]:
+    tails = [path.name for path in paths]
+    for parts in range(2, 1 + max(len(path.parts) for path in paths)):
+        shared = {tail for tail, count in Counter(tails).items() if count > 1}
+        tails = [
+            "/".join(path.parts[-parts:]) if tail in shared else tail for path, tail in zip(paths, tails, strict=True)
+        ]
+    return tails
+
+
+def reduce_panorama(latlong: Latlong, rows: int, columns: int | None = None) -> Float[Tensor, "b rows cols c"]:
+    """Average a map down to fewer pixels, each new one over the solid angle it covers: energy stays as it is.
+
+    Args:
+        latlong: (B, H, 2H, C).
+        rows: of the result, up to H.
+        columns: of the result, up to 2H; twice the rows when not given.
+
+    Raises:
+        ImageError: the map has fewer rows or columns.
+    """
+    height, width = latlong.shape[1:3]
+    columns = 2 * rows if columns is None else columns
+    if not (1 <= rows <= height and 1 <= columns <= width):
+        raise ImageError("panorama", f"is {width} x {height} pixels, {columns} x {rows} or more are accepted")
+    down, across = _shares(*(_heights(count) for count in (height, rows))), _shares(_steps(width), _steps(columns))
+    return torch.einsum("rh,bhwc,kw->brkc", down.to(latlong), latlong, across.to(latlong))
+
+
+def _steps(count: int) -> Float[Tensor, "n"]:
+    return torch.arange(count + 1, dtype=torch.float64) / count
+
+
+def _heights(rows: int) -> Float[Tensor, "n"]:
+    """Edges of a map's rows, as heights on the unit sphere from its north pole: solid angle is even in these."""
+    return 1 - torch.cos(_steps(rows) * math.pi)
+
+
+def _shares(old: Float[Tensor, "n"], new: Float[Tensor, "m"]) -> Float[Tensor, "rows columns"]:
+    """How much of each interval between new edges lies in each between old ones; rows add up to 1."""
+    low, high = torch.maximum(new[:-1, None], old[:-1]), torch.minimum(new[1:, None], old[1:])
+    common = (high - low).clamp(min=0)
+    return common / common.sum(dim=1, keepdim=True)
 
 
 def draw_scenes(folder: Path, kind: str, count: int, height: int, *, report: Callable[[str], None]) -> None:

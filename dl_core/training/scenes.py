@@ -29,12 +29,13 @@ from ..projection import disc_directions
 from ..prompts import DARK_PROMPT, NEGATIVE_PROMPT, PROMPT
 from ..shapes import BallImage, Image, Latlong
 
-__all__ = ["BASE_CAPTIONS", "Picture", "SceneSampler"]
+__all__ = ["ASPECTS", "BASE_CAPTIONS", "Picture", "SceneSampler"]
 
 BASE_CAPTIONS: Final = (PROMPT, DARK_PROMPT, NEGATIVE_PROMPT, "")
 """Everything base training is told, by index."""
 
 ASPECTS: Final = (1.0, 4 / 3, 3 / 2, 16 / 9, 3 / 4, 2 / 3)
+"""Width over height of the photographs."""
 Look = Literal["mirror", "disco", "matte", "tinted"]
 
 
