@@ -16,6 +16,7 @@ from .pairs import FORMAT, INDEX
 from .panoramas import find_panoramas
 from .shard_plan import file_hash, fingerprint, make_plan, write_json
 from .shards import Shard, clear_leftovers, is_whole, planned_shards, write_shard
+from .views import rows_shown
 
 __all__ = ["DataOptions", "hold_out", "make_pairs"]
 
@@ -100,7 +101,8 @@ def make_pairs(
     plan = make_plan(out, asdict(options) | asdict(data), files, report)
     for path in clear_leftovers(out):
         report(f"removed {path.name}, left by a run that was killed")
-    divided = hold_out(plan["used"], data.validation, options.seed)
+    _warn_of_softness(plan["used"], options, report)
+    divided = hold_out(list(plan["used"]), data.validation, options.seed)
     shards = []
     for name, pairs in data.pairs.items():
         planned = planned_shards(name, pairs, data.shard_size)
@@ -120,6 +122,13 @@ def make_pairs(
     }
     write_json(out / INDEX, index)
     return out / INDEX
+
+
+def _warn_of_softness(rows: Mapping[str, int], options: PairOptions, report: Callable[[str], None]) -> None:
+    shown = rows_shown(options.canvas, options.fov)
+    soft = sum(2 * count < shown for count in rows.values())
+    if soft:
+        report(f"{soft} of {len(rows)} maps have less than half the {shown} rows that photographs show, and look soft")
 
 
 def _finished(out: Path, shard: Shard, sampler: PairSampler, report: Callable[[str], None]) -> Mapping[str, Any]:

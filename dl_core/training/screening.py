@@ -25,12 +25,12 @@ class Screening:
     """What became of the panoramas.
 
     Attributes:
-        used: names of those to train on, sorted.
+        used: names of those to train on, sorted, and their rows.
         skipped: why others are not fit, by name.
         duplicates: names of those left out, and what each shows again.
     """
 
-    used: tuple[str, ...]
+    used: Mapping[str, int]
     skipped: Mapping[str, str]
     duplicates: Mapping[str, str]
 
@@ -77,4 +77,4 @@ def screen(files: Mapping[str, Path], report: Callable[[str], None]) -> Screenin
     duplicates = find_duplicates({name: signatures[name] for name in largest_first})
     for name, of in sorted(duplicates.items()):
         report(f"left out {name}: shows what {of} shows")
-    return Screening(tuple(sorted(signatures.keys() - duplicates.keys())), skipped, duplicates)
+    return Screening({name: rows[name] for name in sorted(rows.keys() - duplicates.keys())}, skipped, duplicates)

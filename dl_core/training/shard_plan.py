@@ -90,7 +90,7 @@ def make_plan(
     if not found.used:
         reasons = "; ".join(f"{name} {reason}" for name, reason in list(found.skipped.items())[:_MANY])
         raise OptionError("panoramas", f"{len(files)} files, none of them fit", f"HDR maps ({reasons})")
-    plan = asked | {"used": list(found.used), "skipped": dict(found.skipped), "duplicates": dict(found.duplicates)}
+    plan = asked | {"used": dict(found.used), "skipped": dict(found.skipped), "duplicates": dict(found.duplicates)}
     write_json(folder / PLAN, plan)
     return plan
 

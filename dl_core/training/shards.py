@@ -28,6 +28,7 @@ from .pairs import pair_key
 
 __all__ = ["Shard", "clear_leftovers", "is_whole", "pair_members", "planned_shards", "write_shard"]
 
+SPLITS: Final = ("training", "validation")
 KINDS: Final = ("image.png", "mask.png", "depth.png", "json")
 """Ends of a pair's members' names, in their order."""
 COMPRESSION: Final = 3
@@ -136,6 +137,7 @@ def is_whole(folder: Path, shard: Shard) -> bool:
 
 def clear_leftovers(folder: Path) -> Iterator[Path]:
     """Remove what killed runs have left of shards they were writing, and name it."""
-    for path in sorted(folder.glob(".*-*.*.tar")):
-        path.unlink(missing_ok=True)
-        yield path
+    for split in SPLITS:
+        for path in sorted(folder.glob(f".{split}-??????.????????.tar")):
+            path.unlink(missing_ok=True)
+            yield path

@@ -20,7 +20,7 @@ from ..geometry import camera_rotation, latlong_to_ball, latlong_to_perspective
 from ..shapes import BallImage, Latlong
 from .panoramas import reduce_panorama
 
-__all__ = ["Camera", "Surroundings", "take_ball", "take_photograph"]
+__all__ = ["Camera", "Surroundings", "rows_shown", "take_ball", "take_photograph"]
 
 BALL_SAMPLES: Final = 3
 """Along a side of a ball's pixel."""
@@ -63,7 +63,7 @@ class Surroundings:
     """
 
     ahead: Latlong
-    around: Latlong
+    around: Float[Tensor, "b rows cols c"]
 
     @classmethod
     def of(cls, latlong: Latlong, side: int, fov: float, diameter: int) -> Surroundings:
@@ -76,7 +76,7 @@ class Surroundings:
             diameter: of the balls, pixels.
         """
         rows = latlong.shape[1]
-        ahead = min(rows, math.ceil(math.pi / _pixel_angle(side, fov)))
+        ahead = min(rows, rows_shown(side, fov))
         around = min(rows, max(2 * diameter, BALL_ROWS))
         return cls(*(latlong if kept == rows else reduce_panorama(latlong, kept) for kept in (ahead, around)))
 
@@ -84,6 +84,16 @@ class Surroundings:
     def nbytes(self) -> int:
         """Memory they take."""
         return self.ahead.nbytes + (0 if self.around is self.ahead else self.around.nbytes)
+
+
+def rows_shown(side: int, fov: float) -> int:
+    """Rows of a map that a photograph shows pixel by pixel; one with fewer looks soft.
+
+    Args:
+        side: longer side of the photograph, pixels.
+        fov: across it, degrees.
+    """
+    return math.ceil(math.pi / _pixel_angle(side, fov))
 
 
 def _pixel_angle(side: int, fov: float) -> float:
