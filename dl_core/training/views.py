@@ -1,9 +1,13 @@
 """What a camera in a panorama sees: a photograph, and a mirror ball, at a cost that many pairs can be made at.
 
-Measured against many samples on a map of 1,024 rows with detail in every pixel, a ball of 256 pixels: map reduced to
-512 rows and 3 samples a side, 1.0 codes of 8 bits RMS (4.4 from 256 rows, 0.7 from 1,024 rows in twice the time) and
-0.1% of the energy; one sample a side, 4.7 codes. A photograph of 1,024 pixels: one sample a pixel where that is less
-than half a map pixel, 0.2 codes, in 40% of the time of four.
+Maps are first reduced, by exact solid angles, to what the view can show; few samples are then enough. Measured against
+many samples of the whole map, in display codes of 8 bits:
+
+A ball of 256 pixels, map of 1,024 rows with detail in every pixel: from 512 rows with 3 samples a side 1.0 RMS and 0.1%
+of the energy; with 1 sample 4.7; from 256 rows 4.4; from all 1,024 rows 0.7, in twice the time.
+
+A photograph of 1,024 pixels, map of 2,048 rows with noise in every pixel: one sample 0.6 RMS, at 45 degrees of
+elevation 0.8 with steps 14% too steep; four samples 0.2 in three times the time.
 """
 
 from __future__ import annotations
@@ -103,9 +107,7 @@ def _pixel_angle(side: int, fov: float) -> float:
 
 def take_photograph(scene: Surroundings, camera: Camera, height: int, width: int) -> Float[Tensor, "b rows columns c"]:
     """Radiance that a camera sees, (1, height, width, 3)."""
-    map_pixel = math.pi / scene.ahead.shape[1]
-    samples = 1 if 2 * _pixel_angle(max(height, width), camera.fov) <= map_pixel else 2
-    return latlong_to_perspective(scene.ahead, height, width, fov=camera.fov, rotation=camera.axes, samples=samples)
+    return latlong_to_perspective(scene.ahead, height, width, fov=camera.fov, rotation=camera.axes, samples=1)
 
 
 def take_ball(scene: Surroundings, camera: Camera, diameter: int) -> BallImage:
