@@ -312,13 +312,16 @@ def test_a_killed_run_goes_on_at_the_first_missing_shard(maps: Path, tmp_path: P
     subprocess.run(command(maps, whole), check=True, env=environment(), capture_output=True)
     process = subprocess.Popen(command(maps, killed), env=environment(), stderr=subprocess.DEVNULL)
     first = killed / "training-000000.tar"
-    half: list[Path] = []
     deadline = time.monotonic() + 120
-    while not (first.is_file() and half):
+    while True:
         assert process.poll() is None, "it ended before it could be killed"
         assert time.monotonic() < deadline
-        time.sleep(0.002)
-        half = list(killed.glob(".training-000001.*")) if first.is_file() else []
+        # Stopped, it cannot finish the shard between the look and the kill.
+        process.send_signal(signal.SIGSTOP)
+        if first.is_file() and list(killed.glob(".training-*")):
+            break
+        process.send_signal(signal.SIGCONT)
+        time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (killed / "index.json").exists()
