@@ -7,6 +7,7 @@ from typing import Final
 
 import torch
 
+from ..geometry import rotate_latlong
 from ..imageio import write_exr
 from ..shapes import Latlong
 from .panoramas import reduce_panorama
@@ -25,7 +26,9 @@ def mean_light(sampler: SceneSampler, pictures: int) -> Latlong:
     """Mean light around the first pictures of a sampler, (1, 32, 64, 3), on the scale of their photographs' EV 0."""
     total = torch.zeros(1, ROWS, 2 * ROWS, 3)
     for index in range(pictures):
-        total += reduce_panorama(sampler.light(index).clamp(max=CEILING), ROWS)
+        light, rotation = sampler.light(index)
+        # Reduced before it is turned: a mean has no detail to lose, and turning costs by the pixel.
+        total += rotate_latlong(reduce_panorama(light.clamp(max=CEILING), ROWS), rotation)
     return total / pictures
 
 

@@ -22,7 +22,6 @@ from ..geometry import (
     ball_coverage,
     camera_rotation,
     latlong_to_perspective,
-    rotate_latlong,
     sample_latlong,
 )
 from ..projection import disc_directions
@@ -99,10 +98,10 @@ class SceneSampler:
         crop = expose(radiance, ev)
         return Picture(_blend(canvas, crop, ball), ball, ev, caption)
 
-    def light(self, index: int) -> Latlong:
-        """The light around the picture of an index, (1, H, 2H, 3): as its camera stands, on its scale of exposure."""
+    def light(self, index: int) -> tuple[Latlong, Tensor]:
+        """The panorama around the picture of an index, on its scale of exposure, and its camera's rotation, (3, 3)."""
         light, rotation, _ = self._view(torch.Generator().manual_seed(self.seed * 1_000_003 + index))
-        return rotate_latlong(light, rotation)
+        return light, rotation
 
     def _view(self, generator: Generator) -> tuple[Latlong, Tensor, Float[Tensor, "1 side side 3"]]:
         """A panorama on the scale of a photograph's exposure, the camera's rotation, and the photograph; radiance."""
