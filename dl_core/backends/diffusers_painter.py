@@ -26,6 +26,7 @@ from torch import Tensor
 from ..ball import Ball, crop_ball, disc_mask, require_canvas
 from ..batches import Batches, is_out_of_memory
 from ..errors import ModelError, OptionError
+from ..exposure_prompts import embedding_at
 from ..lora import EXPOSURE_SCALE, LoraSwap
 from ..painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
 from ..shapes import BallImage, Image
@@ -75,7 +76,8 @@ class DiffusersPainter:
     """Paints chrome balls with a diffusers pipeline's networks.
 
     Args:
-        pipeline: its networks, text encoders and scheduler configuration are used; its own call is not.
+        pipeline: its networks, text encoders and scheduler configuration are used; its own call is not. Without a
+            ControlNet the ball is painted by inpainting alone.
         defaults: prompts, guidance, scale of ControlNet and LoRA, and the EV of the dark prompt.
         sampler: a name of `SAMPLERS`.
         batch: balls denoised at once; less memory with less. Where a batch does not fit, it is halved from there on.
@@ -268,15 +270,17 @@ class DiffusersPainter:
         def denoise(noisy: Tensor, timestep: Tensor) -> Tensor:
             latents = noisy.to(unet.dtype)
             doubled = latents if scale == 1 else torch.cat((latents, latents))
-            down, middle = controlnet(
-                doubled,
-                timestep,
-                encoder_hidden_states=tokens,
-                controlnet_cond=depth,
-                conditioning_scale=self.defaults.control_scale,
-                added_cond_kwargs=added,
-                return_dict=False,
-            )
+            down, middle = None, None
+            if controlnet is not None:
+                down, middle = controlnet(
+                    doubled,
+                    timestep,
+                    encoder_hidden_states=tokens,
+                    controlnet_cond=depth,
+                    conditioning_scale=self.defaults.control_scale,
+                    added_cond_kwargs=added,
+                    return_dict=False,
+                )
             predicted = unet(
                 doubled,
                 timestep,
@@ -304,13 +308,12 @@ class DiffusersPainter:
             self._acting = turn
 
     def guidance_at(self, ev: float) -> Guidance:
-        """Embeddings at an EV: ξ(ev) = ξ_o + (ev / EV_min) (ξ_d - ξ_o), tokens and pooled alike (Sec. 4.2)."""
+        """Embeddings at an EV, see `exposure_prompts`."""
         own, unwanted, own_pooled, unwanted_pooled = self._embed(self.defaults.prompt)
         dark, _, dark_pooled, _ = self._embed(self.defaults.dark_prompt)
-        share = ev / self.defaults.ev_min
-        return Guidance(
-            torch.lerp(own, dark, share), torch.lerp(own_pooled, dark_pooled, share), unwanted, unwanted_pooled
-        )
+        evs, ev_min = torch.tensor([ev]), self.defaults.ev_min
+        tokens = embedding_at(own, dark, evs, ev_min)
+        return Guidance(tokens, embedding_at(own_pooled, dark_pooled, evs, ev_min), unwanted, unwanted_pooled)
 
     @torch.no_grad()
     def _embed(self, prompt: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:

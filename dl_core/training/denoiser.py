@@ -31,10 +31,12 @@ __all__ = [
     "OFF_BALL_WEIGHT",
     "Batch",
     "TextBank",
+    "blind_share",
     "draw_batch",
     "latent_disc",
     "time_ids",
     "velocity_loss",
+    "weighted_error",
 ]
 
 _NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
@@ -112,8 +114,9 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     high_levels = torch.randint(600, 1000, (size,), generator=generator)
     levels = torch.where(torch.rand(size, generator=generator) < noisiest, high_levels, levels)
     noise = torch.randn(clean.shape, generator=generator)
-    discs = torch.cat([latent_disc(picture.ball, clean.shape[-1]) for picture in pictures])
-    blind = torch.rand(size, generator=generator) < (levels - BLIND_FROM) / (BLIND_ABOVE - BLIND_FROM)
+    side = clean.shape[-1]
+    discs = torch.cat([latent_disc(picture.ball, side, grow=picture.ball.dilation) for picture in pictures])
+    blind = torch.rand(size, generator=generator) < blind_share(levels)
     shown = clean * (1 - discs * blind.view(-1, 1, 1, 1))
     return Batch(
         noisy=_NOISE.add_noise(shown, noise, levels),
@@ -126,9 +129,14 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     )
 
 
-def latent_disc(ball: Ball, side: int) -> Float[Tensor, "1 1 m m"]:
-    """The inpaint disc at latent size: the share of each latent that it covers."""
-    return torch.nn.functional.interpolate(disc_mask(ball, grow=ball.dilation)[None], size=(side, side), mode="area")
+def blind_share(levels: Tensor) -> Tensor:
+    """Share of pictures whose ball is shown as noise alone, by noise level; the share of certainty is 1 and above."""
+    return (levels - BLIND_FROM) / (BLIND_ABOVE - BLIND_FROM)
+
+
+def latent_disc(ball: Ball, side: int, *, grow: float) -> Float[Tensor, "1 1 m m"]:
+    """A ball's disc, larger by `grow` pixels, at latent size: the share of each latent that it covers."""
+    return torch.nn.functional.interpolate(disc_mask(ball, grow=grow)[None], size=(side, side), mode="area")
 
 
 def _enlarge(ball: Ball, scale: int) -> Ball:
@@ -137,4 +145,9 @@ def _enlarge(ball: Ball, scale: int) -> Ball:
 
 def velocity_loss(predicted: Tensor, batch: Batch) -> Float[Tensor, ""]:
     """Weighted mean squared error of the predicted velocity."""
-    return (batch.weights * (predicted - batch.target).square()).sum() / (batch.weights.sum() * predicted.shape[1])
+    return weighted_error(predicted, batch.target, batch.weights)
+
+
+def weighted_error(predicted: Tensor, target: Tensor, weights: Float[Tensor, "b 1 m m"]) -> Float[Tensor, ""]:
+    """Weighted mean squared error of predictions (B, C, m, m)."""
+    return (weights * (predicted - target).square()).sum() / (weights.sum() * predicted.shape[1])

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..backends.mini import MiniModel
+from ..exposure_prompts import embedding_at
 from ..prompts import DARK_PROMPT, PROMPT
 from .autoencoder import block_latents
 from .base import wake_text_encoders
@@ -55,15 +56,16 @@ def train_regressor(
     def loss_of_step(step: int) -> Tensor:
         pictures = [sampler.draw(step * batch + i) for i in range(batch)]
         clean = block_latents(torch.cat([picture.canvas_ldr for picture in pictures]), blocks)
-        discs = torch.cat([latent_disc(picture.ball, clean.shape[-1]) for picture in pictures])
-        share = torch.tensor([picture.ev / sampler.ev_min for picture in pictures]).view(-1, 1)
+        latents = clean.shape[-1]
+        discs = torch.cat([latent_disc(picture.ball, latents, grow=picture.ball.dilation) for picture in pictures])
+        evs = torch.tensor([picture.ev for picture in pictures])
         tokens, pooled = bank.embed()
         found = model.unet(
             visible(clean, discs),
             torch.zeros(batch, dtype=torch.long),
-            torch.lerp(tokens[original], tokens[dark], share[..., None]),
+            embedding_at(tokens[original, None], tokens[dark, None], evs, sampler.ev_min),
             added_cond_kwargs={
-                "text_embeds": torch.lerp(pooled[original], pooled[dark], share),
+                "text_embeds": embedding_at(pooled[original, None], pooled[dark, None], evs, sampler.ev_min),
                 "time_ids": time_ids(batch, side),
             },
         ).sample

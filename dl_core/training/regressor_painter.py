@@ -45,7 +45,7 @@ class RegressorPainter(DiffusersPainter):
         self, request: PaintRequest, encoded: Any, seeds: tuple[int, ...], counted: Callable[[int], None]
     ) -> Tensor:
         clean, _ = self._start(encoded, seeds)
-        disc = latent_disc(request.ball, clean.shape[-1])
+        disc = latent_disc(request.ball, clean.shape[-1], grow=request.ball.dilation)
         guidance, count = self.guidance_at(request.ev), len(seeds)
         found = self.pipeline.unet(
             visible(clean, disc.expand(count, -1, -1, -1)),
