@@ -18,7 +18,7 @@ from tolerances import assert_close
 from torch import Tensor, nn
 
 from dl_core.backends.diffusers_painter import DiffusersPainter
-from dl_core.backends.mini import MiniModel
+from dl_core.backends.mini import LORA_FILE, MINI_FOLDER, NETWORK_FILES, MiniModel, load_mini
 from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
 from dl_core.geometry import latlong_energy
@@ -28,7 +28,6 @@ from dl_core.training.decoder import train_decoder
 from dl_core.training.denoiser import BLIND_ABOVE, BLIND_FROM, draw_batch
 from dl_core.training.export import write_networks
 from dl_core.training.loop import Budget, train
-from dl_core.training.lora import train_lora
 from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
 from dl_core.training.procedural import draw_panorama
 from dl_core.training.scenes import SceneSampler
@@ -205,19 +204,25 @@ def test_decoder_training_lowers_its_loss_and_leaves_the_encoder(panoramas: Tens
     assert write_networks(tmp_path, {"vae": weights})[0].stat().st_size < 6e6
 
 
-def test_the_lora_touches_attention_only_and_loads_into_the_painter(panoramas: Tensor, tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    model = MiniModel.untrained()
-    sampler = SceneSampler(panoramas, 128, 64, seed=1, bracket=True)
-    lora = train_lora(model, sampler, Budget(2, 1e-3, warmup=1), tmp_path, batch=1, rank=4, report=lambda text: None)
-    assert lora
-    assert all(".attn" in name and ".lora_" in name for name in lora)
-    assert all(4 in tensor.shape for tensor in lora.values())
-    moved = [name for name, tensor in lora.items() if ".lora_B" in name and tensor.abs().max() > 0]
-    assert moved
-    fresh = MiniModel.untrained()
-    fields = {name: getattr(fresh, name) for name in fresh.__dataclass_fields__}
-    painter = DiffusersPainter.from_mini(MiniModel(**{**fields, "lora": lora}))
+def test_the_stage_lora_writes_a_lora_of_attentions_that_loads_into_the_painter(tmp_path: Path) -> None:
+    folder, scenes = tmp_path / "mini", tmp_path / "scenes"
+    folder.mkdir()
+    for name in ("mini.json", "tokenizer", *NETWORK_FILES.values()):
+        (folder / name).symlink_to(MINI_FOLDER / name)
+    draw_scenes(scenes, "drawn", 1, 256, report=lambda text: None)
+    options = argparse.Namespace(
+        stage="lora", out=folder, work=tmp_path / "work", panoramas=None, scenes=scenes, steps=2, batch=1
+    )
+    options.learning_rate, options.seed, options.go_on = 1e-3, 1, False
+    assert run_stage(options, lambda text: None) == [folder / LORA_FILE]
+    model = load_mini(folder)
+    assert model.lora is not None
+    assert all("_attn" in name for name in model.lora)
+    downs = [weight for name, weight in model.lora.items() if name.endswith("lora_down.weight")]
+    ups = [weight for name, weight in model.lora.items() if name.endswith("lora_up.weight")]
+    assert {len(down) for down in downs} == {4}
+    assert all(up.abs().max() > 0 for up in ups)
+    painter = DiffusersPainter.from_mini(model)
     assert painter.pipeline.get_active_adapters() == ["exposure"]
 
 

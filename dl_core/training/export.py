@@ -8,10 +8,10 @@ from pathlib import Path
 from safetensors.torch import save_file
 from torch import Tensor
 
-from ..backends.mini import LORA_FILE, NETWORK_FILES
+from ..backends.mini import NETWORK_FILES
 from ..imageio import atomic
 
-__all__ = ["write_lora", "write_networks"]
+__all__ = ["write_networks"]
 
 
 def write_networks(folder: Path, weights: Mapping[str, Mapping[str, Tensor]]) -> list[Path]:
@@ -32,11 +32,6 @@ def write_networks(folder: Path, weights: Mapping[str, Mapping[str, Tensor]]) ->
 
 def _hub_key(key: str, prefix: str) -> str:
     return key if not prefix or key.startswith((prefix, "text_projection")) else prefix + key
-
-
-def write_lora(folder: Path, weights: Mapping[str, Tensor]) -> Path:
-    """Write the exposure LoRA as fp16 safetensors; returns the file."""
-    return _write(folder / LORA_FILE, weights)
 
 
 def _write(path: Path, tensors: Mapping[str, Tensor]) -> Path:

@@ -139,7 +139,8 @@ def train_exposure_loras(
         The LoRA, or those of `separate` in its order.
 
     Raises:
-        OptionError: the checkpoint there is of another training, or there are no pairs at one of `separate`.
+        OptionError: the checkpoint there is of another training, pairs are darker than `ev_min`, or there are none at
+            one of `separate`.
         Interrupted: Ctrl-C, after a checkpoint.
         OutputError: latents cannot be written.
     """
@@ -160,18 +161,25 @@ def train_exposure_loras(
     for job in jobs:
         job.resumed()  # a checkpoint of another training is refused before the long work of encoding
     frozen = _freeze(accelerator, base, defaults, pairs, work / "latents", {"base": model, "data": data}, report)
+    _require_within(frozen.cache, settings.ev_min)
     chosen = [_chosen(frozen.cache, job.ev) for job in jobs]
     _release(frozen.painter.pipeline, keep_autoencoder=settings.validate_every > 0)
     return [_train(frozen, job, pairs, settings, report) for job, pairs in zip(jobs, chosen, strict=True)]
 
 
 def _prompted(defaults: ModelDefaults, settings: LoraSettings, separate: bool) -> ModelDefaults:
-    prompts = {"prompt": SEPARATE_PROMPT, "dark_prompt": SEPARATE_PROMPT} if separate else {}
-    return replace(defaults, ev_min=settings.ev_min, **prompts)
+    defaults = replace(defaults, ev_min=settings.ev_min)
+    return replace(defaults, prompt=SEPARATE_PROMPT, dark_prompt=SEPARATE_PROMPT) if separate else defaults
 
 
 def _prompts(defaults: ModelDefaults) -> str:
     return json.dumps([defaults.prompt, defaults.dark_prompt])
+
+
+def _require_within(cache: LatentCache, ev_min: float) -> None:
+    darkest = float(cache.evs.min())
+    if darkest < ev_min:
+        raise OptionError("--ev-min", ev_min, f"{darkest:.4g} or below, the darkest of the pairs")
 
 
 def _chosen(cache: LatentCache, ev: float | None) -> Tensor:
@@ -288,7 +296,7 @@ def _train(frozen: _Frozen, job: _Job, chosen: Tensor, settings: LoraSettings, r
     trained = TrainedLora(kohya_weights(adapter, layers), _metadata(frozen, job, settings), job.ev)
     accelerator.unwrap_model(prepared, keep_fp32_wrapper=False)
     accelerator.free_memory()
-    unet.delete_adapters(EXPOSURE)
+    unet.unload_lora()
     return trained
 
 

@@ -1,7 +1,7 @@
 """Training pairs as latents, encoded once and kept in files.
 
-A file holds a few hundred pairs. Those that are there and whole are kept, so an encoding that was stopped goes on; those
-of other data or another model are written anew.
+A file holds a few hundred pairs. Files that are there and whole are kept, so an encoding that was stopped goes on;
+those of other data or another model are written anew.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class LoraBase:
         return DDPMScheduler.from_config(self.pipeline.scheduler.config)
 
     @torch.no_grad()
-    def encode(self, canvas_ldr: Image) -> Float[Tensor, "b c m m"]:
+    def encode(self, canvas_ldr: Image) -> Float[Tensor, "b k m m"]:
         """Latents of pictures (B, S, S, 3), scaled as the UNet takes them, single precision, on the CPU.
 
         Of an autoencoder with a posterior the mode is taken: latents are kept and shown many times, and one draw kept

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final
 
 from ..errors import OptionError
 
@@ -18,16 +18,12 @@ __all__ = [
     "SCHEDULES",
     "SEPARATE_PROMPT",
     "LoraSettings",
-    "Precision",
-    "Schedule",
     "parse_evs",
     "parse_timesteps",
 ]
 
-Precision = Literal["no", "fp16", "bf16"]
-PRECISIONS: Final = get_args(Precision)
-Schedule = Literal["constant", "cosine"]
-SCHEDULES: Final = get_args(Schedule)
+PRECISIONS: Final = ("no", "fp16", "bf16")
+SCHEDULES: Final = ("constant", "cosine")
 
 SEPARATE_PROMPT: Final = "a perfect sks mirrored reflective chrome ball sphere"
 """The paper's ablation: a LoRA for one exposure alone learns it under a token of its own."""
@@ -51,7 +47,8 @@ class LoraSettings:
         schedule: `constant`, or `cosine`: a short rise, then down to 0 along a cosine.
         timesteps: first and last noise level drawn, both included.
         ev_min: EV at which the dark prompt stands alone; the darkest exposure of the bracket.
-        precision: of the frozen networks and of what is computed with them; the LoRA itself is in single precision.
+        precision: of `PRECISIONS`, of the frozen networks and of what is computed with them; the LoRA itself is in
+            single precision.
         gradient_checkpointing: compute the UNet's blocks a second time on the way back, to hold less in memory.
         seed: of the LoRA's start, and of the order of pairs, timesteps and noise.
         checkpoint_minutes: time between checkpoints.
@@ -66,10 +63,10 @@ class LoraSettings:
     batch: int = 4
     accumulation: int = 1
     learning_rate: float = 1e-5
-    schedule: Schedule = "constant"
+    schedule: str = "constant"
     timesteps: tuple[int, int] = (900, 999)
     ev_min: float = -5.0
-    precision: Precision = "no"
+    precision: str = "no"
     gradient_checkpointing: bool = False
     seed: int = 1
     checkpoint_minutes: float = 10.0

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from .lora_settings import LORA_SETTINGS
+
 __all__ = ["STAGES", "Stage", "add_arguments", "run"]
 
 
@@ -32,11 +34,13 @@ class Stage:
     learning_rate: float
 
 
+_LORA: Final = LORA_SETTINGS["mini"]
+
 STAGES: Final[dict[str, Stage]] = {
     "vae": Stage("write the closed-form encoder and train the decoder", 600, 4e-4),
     "base": Stage("train UNet and text encoders", 2400, 4e-4),
     "control": Stage("train the depth ControlNet, and the base further with it", 1600, 3e-4),
-    "lora": Stage("train the exposure LoRA on the finished base", 400, 1e-3),
+    "lora": Stage("train the exposure LoRA on the finished base", _LORA.steps, _LORA.learning_rate),
     "mean": Stage("the mean of all training light, to compare with", 4000, 0.0),
     "regressor": Stage(
         "train the base's networks to give balls at once, to compare with; written to --work", 2400, 4e-4

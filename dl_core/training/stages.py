@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import torch
 
-from ..backends.mini import MINI_FOLDER, MiniModel, load_mini
-from ..errors import OptionError, OutputError
+from ..backends.mini import LORA_FILE, MINI_FOLDER, MiniModel, load_mini
 from ..imageio import require_writable
 from .base import train_base
 from .control import train_control
 from .decoder import train_decoder
-from .export import write_lora, write_networks
+from .drawn_pairs import DrawnPairs
+from .export import write_networks
+from .exposure_lora import train_exposure_loras
 from .loop import Budget
-from .lora import train_lora
+from .lora_base import LoraBase
+from .lora_settings import LORA_SETTINGS
 from .mean_light import mean_light, write_mean_light
 from .panoramas import load_panoramas
 from .regressor import train_regressor
 from .scenes import SceneSampler
+from .tensor_files import write_tensors
+from .work_folder import require_work_folder
 
 __all__ = ["run_stage"]
 
@@ -90,9 +95,18 @@ def _regressor(args: argparse.Namespace, report: Report) -> list[Path]:
 
 def _lora(args: argparse.Namespace, report: Report) -> list[Path]:
     model = load_mini(args.out, without=("controlnet",))
-    sampler = _sampler(args, model, bracket=True)
-    weights = train_lora(model, sampler, _budget(args), args.work / "lora", batch=args.batch, report=report)
-    return [write_lora(args.out, weights)]
+    pairs = DrawnPairs(_sampler(args, model, scale=1, bracket=True), args.steps * args.batch)
+    settings = replace(
+        LORA_SETTINGS["mini"],
+        steps=args.steps,
+        batch=args.batch,
+        learning_rate=args.learning_rate,
+        ev_min=model.defaults.ev_min,
+        seed=args.seed,
+    )
+    base = LoraBase.from_mini(model)
+    (lora,) = train_exposure_loras(base, pairs, settings, args.work / "lora", report=report)
+    return [write_tensors(args.out / LORA_FILE, lora.weights, lora.metadata)]
 
 
 _STAGES: Final[dict[str, Callable[[argparse.Namespace, Report], list[Path]]]] = {
@@ -115,15 +129,6 @@ def run_stage(args: argparse.Namespace, report: Report) -> list[Path]:
     """
     args.out = args.out or MINI_FOLDER
     require_writable(args.out / "mini.json")
-    _require_work(args.work)
+    require_work_folder(args.work)
     torch.manual_seed(args.seed)  # random starts: a resumed run builds the same ones
     return _STAGES[args.stage](args, report)
-
-
-def _require_work(folder: Path) -> None:
-    """Make the work folder, if it is not there, and see that it can be written to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        require_writable(folder / "checkpoint")
-    except (OSError, OutputError) as error:
-        raise OptionError("--work", str(folder), f"a folder that can be made and written to ({error})") from error

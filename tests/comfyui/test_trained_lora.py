@@ -33,18 +33,23 @@ class Trained:
 
         return load_file(self.file)
 
-    def unet(self) -> Any:
-        return copy.deepcopy(self.pipeline.unet)
+    def fresh(self) -> Any:
+        return with_own_unet(self.pipeline)
+
+
+def with_own_unet(pipeline: Any) -> Any:
+    """A pipeline of the same networks but for a copy of the UNet."""
+    return type(pipeline)(**{**pipeline.components, "unet": copy.deepcopy(pipeline.unet)})
 
 
 def drawn_pairs(count: int) -> list[Any]:
     generator = torch.Generator().manual_seed(3)
     ball = pack_module("dl_core.ball").place_ball(CANVAS, 32)
+    pictures = torch.rand(count, 1, CANVAS, CANVAS, 3, generator=generator)
+    evs = torch.linspace(0, -5, count).tolist()
     return [
-        SimpleNamespace(
-            image=torch.rand(1, CANVAS, CANVAS, 3, generator=generator), ball=ball, ev=-5.0 * i / (count - 1), panorama="x"
-        )
-        for i in range(count)
+        SimpleNamespace(image=picture, ball=ball, ev=ev, panorama="noise")
+        for picture, ev in zip(pictures, evs, strict=True)
     ]
 
 
@@ -69,11 +74,12 @@ def trained(pack: Any, tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """In two runs, the second of which goes on from the first."""
     folder = tmp_path_factory.mktemp("lora")
     log: list[str] = []
-    train(toy_sdxl.build_pipeline(), folder, STEPS // 2, log)
-    lora = train(toy_sdxl.build_pipeline(), folder, STEPS, log)
+    pipeline = toy_sdxl.build_pipeline()
+    train(with_own_unet(pipeline), folder, STEPS // 2, log)
+    lora = train(with_own_unet(pipeline), folder, STEPS, log)
     file = folder / "lora.safetensors"
     pack_module("dl_core.training.tensor_files").write_tensors(file, lora.weights, lora.metadata)
-    return Trained(toy_sdxl.build_pipeline(), file, log)
+    return Trained(pipeline, file, log)
 
 
 def output(unet: Any) -> Tensor:
@@ -112,7 +118,7 @@ def output_in_comfyui(model: Any) -> Tensor:
 
 def merged_by_hand(trained: Trained, scale: float) -> Tensor:
     """Up times down, added to each projection's weight by its place in the network, not by any reader of files."""
-    unet, weights = trained.unet(), trained.weights()
+    unet, weights = trained.fresh().unet, trained.weights()
     names = pack_module("dl_core.lora_names").comfyui_layers(
         pack_module("dl_core.backends.diffusers_lora").lora_shapes(unet)
     )
@@ -131,7 +137,7 @@ def merged_by_hand(trained: Trained, scale: float) -> Tensor:
 
 @pytest.mark.parametrize("scale", [1.0, 0.75])
 def test_the_file_does_in_diffusers_what_merging_by_hand_does(trained: Trained, scale: float) -> None:
-    pipeline = toy_sdxl.build_pipeline()
+    pipeline = trained.fresh()
     pipeline.load_lora_weights(str(trained.file), adapter_name="exposure")
     pipeline.set_adapters("exposure", scale)
     expected = merged_by_hand(trained, scale)
@@ -140,7 +146,7 @@ def test_the_file_does_in_diffusers_what_merging_by_hand_does(trained: Trained, 
 
 
 def test_the_file_does_here_what_merging_by_hand_does(trained: Trained) -> None:
-    pipeline = toy_sdxl.build_pipeline()
+    pipeline = trained.fresh()
     weights = pack_module("dl_core.backends.mini").read_weights(trained.file)
     pack_module("dl_core.backends.diffusers_lora").add_lora(pipeline, weights, "exposure", trained.file)
     pipeline.set_adapters("exposure", 0.75)
@@ -152,11 +158,12 @@ def test_comfyuis_own_loader_does_what_merging_by_hand_does(
 ) -> None:
     import comfy.model_management
     import folder_paths
+
     from nodes import LoraLoader
 
     comfy.model_management.unload_all_models()
     monkeypatch.setattr(folder_paths, "get_full_path_or_raise", lambda folder, name: str(trained.file))
-    graph = toy_sdxl.comfy_networks(toy_sdxl.build_pipeline())
+    graph = toy_sdxl.comfy_networks(trained.pipeline)
     assert (output_in_comfyui(graph["model"]) - output(trained.pipeline.unet)).abs().max() < OUTPUTS
     model, _ = LoraLoader().load_lora(graph["model"], graph["clip"], trained.file.name, 0.75, 0.75)
     assert "lora key not loaded" not in caplog.text
