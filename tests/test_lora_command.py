@@ -5,17 +5,21 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import os
+import subprocess
+import sys
 import tarfile
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 import torch
-from diffusers import UNet2DConditionModel
+from diffusers import StableDiffusionXLPipeline, UNet2DConditionModel
 from lora_training import random_pairs
 from PIL import Image as PILImage
 from safetensors import safe_open
 
+from dl_core.backends.diffusers_painter import DiffusersPainter
 from dl_core.backends.mini import UNET_CONFIG, load_mini, read_weights
 from dl_core.backends.sdxl_files import SDXL_FOLDER
 from dl_core.cli import main
@@ -26,6 +30,8 @@ from dl_core.training.lora_memory import step_memory
 from dl_core.training.lora_run import settings_of
 from dl_core.training.lora_settings import LORA_SETTINGS, LoraSettings
 from dl_core.training.pairs import FORMAT, INDEX, pair_key
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture
@@ -74,6 +80,23 @@ def test_from_shards_to_a_file(shards: Path, capsys: pytest.CaptureFixture[str])
     assert main(command(shards)) == 0
     assert main(command(shards, "--rank", "8")) == 2
     assert "--rank is '8'" in capsys.readouterr().err
+
+
+def test_a_folder_in_diffusers_layout_in_half_precision(shards: Path) -> None:
+    """In a process of its own: accelerate keeps a process to one precision."""
+    parts = DiffusersPainter.from_mini(load_mini()).pipeline.components
+    names = ("vae", "text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2", "unet", "scheduler")
+    folder = shards.parent / "model"
+    StableDiffusionXLPipeline(**{name: parts[name] for name in names}).save_pretrained(folder)
+    arguments = command(shards, "--mixed-precision", "bf16", "--validate-every", "1", "--steps", "1")
+    arguments[arguments.index("mini")] = str(folder)
+    script = "import sys; from dl_core.cli import main; sys.exit(main(sys.argv[1:]))"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", script, *arguments], check=True, env=environment, capture_output=True)
+    weights = read_weights(shards.parent / "lora.safetensors")
+    assert all(torch.isfinite(weight).all() for weight in weights.values())
+    assert any(weight.abs().max() > 0 for name, weight in weights.items() if name.endswith("lora_up.weight"))
+    assert (shards.parent / "work" / "pictures" / "step-000001.png").is_file()
 
 
 def test_a_lora_an_exposure(shards: Path) -> None:
