@@ -19,12 +19,12 @@ from lora_training import random_pairs
 from PIL import Image as PILImage
 from safetensors import safe_open
 
-from dl_core.backends.diffusers_painter import DiffusersPainter
 from dl_core.backends.mini import UNET_CONFIG, load_mini, read_weights
 from dl_core.backends.sdxl_files import SDXL_FOLDER
 from dl_core.cli import main
 from dl_core.lora import read_lora
 from dl_core.training.exposure_lora import add_exposure_adapter
+from dl_core.training.lora_base import LoraBase
 from dl_core.training.lora_command import add_arguments
 from dl_core.training.lora_memory import step_memory
 from dl_core.training.lora_run import settings_of
@@ -84,7 +84,7 @@ def test_from_shards_to_a_file(shards: Path, capsys: pytest.CaptureFixture[str])
 
 def test_a_folder_in_diffusers_layout_in_half_precision(shards: Path) -> None:
     """In a process of its own: accelerate keeps a process to one precision."""
-    parts = DiffusersPainter.from_mini(load_mini()).pipeline.components
+    parts = LoraBase.from_mini(load_mini()).pipeline.components
     names = ("vae", "text_encoder", "text_encoder_2", "tokenizer", "tokenizer_2", "unet", "scheduler")
     folder = shards.parent / "model"
     StableDiffusionXLPipeline(**{name: parts[name] for name in names}).save_pretrained(folder)
@@ -92,7 +92,8 @@ def test_a_folder_in_diffusers_layout_in_half_precision(shards: Path) -> None:
     arguments[arguments.index("mini")] = str(folder)
     script = "import sys; from dl_core.cli import main; sys.exit(main(sys.argv[1:]))"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", script, *arguments], check=True, env=environment, capture_output=True)
+    done = subprocess.run([sys.executable, "-c", script, *arguments], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
     weights = read_weights(shards.parent / "lora.safetensors")
     assert all(torch.isfinite(weight).all() for weight in weights.values())
     assert any(weight.abs().max() > 0 for name, weight in weights.items() if name.endswith("lora_up.weight"))

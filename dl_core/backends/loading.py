@@ -14,7 +14,7 @@ from typing import Final
 from ..errors import OptionError
 from ..painter import Imputing, Painter
 
-__all__ = ["BACKENDS", "Backend", "LoadedPainter", "ModelFiles", "choose_backend"]
+__all__ = ["BACKENDS", "Backend", "LoadedPainter", "ModelFiles", "choose_backend", "quiet_libraries"]
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Backend:
     load: Callable[[ModelFiles, Imputing], LoadedPainter]
 
 
-def _quiet_libraries() -> None:
+def quiet_libraries() -> None:
     """Leave the terminal to the progress bar: these libraries announce what they fall back to without torchvision."""
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging
@@ -86,7 +86,7 @@ def _load_mini(files: ModelFiles, impute: Imputing) -> LoadedPainter:
         if getattr(files, name) is not None:
             value = str(getattr(files, name))
             raise OptionError(name, value, "nothing with the backend mini: its folder holds all of it")
-    _quiet_libraries()
+    quiet_libraries()
     from .diffusers_painter import DiffusersPainter
     from .mini import MINI_FOLDER, load_mini
 
@@ -102,7 +102,7 @@ def _load_diffusers(files: ModelFiles, impute: Imputing) -> LoadedPainter:
     if files.model is None or files.controlnet is None:
         name = "model" if files.model is None else "controlnet"
         raise OptionError(name, None, "a local file or folder; the backend diffusers downloads nothing")
-    _quiet_libraries()
+    quiet_libraries()
     from .diffusers_painter import DiffusersPainter
 
     lora, turbo_lora = (files.lora, files.turbo_lora) if files.exposure_lora else (None, None)

@@ -66,6 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Train; an error names the option."""
+    from ..backends.loading import quiet_libraries
+
+    quiet_libraries()  # before they are imported: that is when they speak
     from .lora_run import memory_of, run_lora
 
     if args.memory:
