@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 import torch
 from diffusers import DDPMScheduler
+from foreground import hear_ctrl_c
 from lora_training import CANVAS, SETTINGS, Untrained, random_pairs
 from safetensors.torch import load_file
 from torch import Tensor
@@ -301,6 +302,7 @@ from dataclasses import replace
 from pathlib import Path
 import torch
 sys.path.insert(0, {tests!r})
+from foreground import hear_ctrl_c
 from lora_training import SETTINGS, Untrained, random_pairs
 from dl_core.training.exposure_lora import train_exposure_loras
 from dl_core.training.tensor_files import write_tensors
@@ -334,7 +336,8 @@ def one_thread() -> Iterator[None]:
 
 def started(script: Path, work: Path, steps: int) -> subprocess.Popen[str]:
     command = [sys.executable, str(script), str(work), str(steps), "1", "0"]
-    return subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, env=environment(), preexec_fn=hear_ctrl_c, text=True, **pipes)
 
 
 def wait_for_step(process: subprocess.Popen[str], work: Path, step: int) -> None:

@@ -15,13 +15,14 @@ __all__ = ["asked_to_stop"]
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Give a function that says whether Ctrl-C was pressed; a second Ctrl-C interrupts at once, as usual.
 
-    Outside the main thread, where signals do not arrive, nothing changes.
+    Outside the main thread, where signals do not arrive, and in a process told to ignore Ctrl-C, as a shell tells those
+    in the background, nothing changes.
     """
     pressed = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
         yield pressed.is_set
         return
-    before = signal.getsignal(signal.SIGINT)
 
     def note(number: int, frame: Any) -> None:
         pressed.set()
