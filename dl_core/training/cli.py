@@ -13,6 +13,9 @@ TRAININGS: Final[dict[str, Subcommand]] = {
     "scenes": Subcommand("draw procedural skies and rooms, or path trace them", f"{__package__}.scenes_command"),
     "data": Subcommand("make pairs to train an exposure LoRA on, from HDR panoramas", f"{__package__}.data_command"),
     "lora": Subcommand("train the exposure LoRA of SDXL or of the mini model", f"{__package__}.lora_command"),
+    "turbo": Subcommand(
+        "train a Turbo LoRA on medians that the iterative method paints", f"{__package__}.turbo_command"
+    ),
     "mini": Subcommand("train a stage of the mini model", f"{__package__}.mini_command"),
 }
 """The commands by name; a new one is a new row."""

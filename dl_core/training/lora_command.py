@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .lora_settings import LORA_SETTINGS, PRECISIONS, SCHEDULES
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["add_arguments", "add_training_arguments", "run"]
 
 
 def _default(name: str) -> str:
@@ -23,6 +23,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--data", type=Path, help="folder of `lightprobe train data`")
+    add_training_arguments(parser)
+    add("--timesteps", metavar="FIRST-LAST", help="noise levels trained on (default: 900-999; mini: 0-999)")
+    add(
+        "--separate",
+        metavar="EV,...",
+        help="in place of one LoRA for all exposures, one for each of these, as in the paper's ablation: "
+        "FILE.ev-2.5.safetensors",
+    )
+    add("--memory", action="store_true", help="only print the bytes a step takes with these options, computed")
+
+
+def add_training_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what every training of a LoRA has: model, files, and all settings but the range of timesteps."""
+    add = parser.add_argument
     add("--model", required=True, help="an SDXL checkpoint or a folder in diffusers' layout; or `mini`")
     add("--controlnet", type=Path, help="depth ControlNet for the pictures of --validate-every (mini: its own)")
     add("--out", type=Path, help="the LoRA, a .safetensors file")
@@ -33,7 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--gradient-accumulation", type=int, help=f"batches to a step {_default('accumulation')}")
     add("--learning-rate", type=float, help=f"of AdamW {_default('learning_rate')}")
     add("--schedule", choices=SCHEDULES, help="of the learning rate (default: constant; mini: cosine)")
-    add("--timesteps", metavar="FIRST-LAST", help="noise levels trained on (default: 900-999; mini: 0-999)")
     add("--ev-min", type=float, help=f"EV at which the dark prompt stands alone {_default('ev_min')}")
     add(
         "--mixed-precision",
@@ -52,15 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="STEPS",
         help="paint a photograph's ball at EV 0, -2.5 and -5 every so many steps, and at the end (default: 0, never)",
-    )
-    add(
-        "--separate",
-        metavar="EV,...",
-        help="in place of one LoRA for all exposures, one for each of these, as in the paper's ablation: "
-        "FILE.ev-2.5.safetensors",
-    )
-    add(
-        "--memory", action="store_true", help="print the bytes a step takes with these options, computed; train nothing"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +24,7 @@ from .pairs import PairShards
 from .tensor_files import write_tensors
 from .work_folder import require_work_folder
 
-__all__ = ["memory_of", "run_lora", "settings_of"]
+__all__ = ["memory_of", "require_outputs", "run_lora", "settings_of", "train_and_write"]
 
 DTYPES: Final = {"no": torch.float32, "fp16": torch.float16, "bf16": torch.bfloat16}
 SPOKEN_ALIKE: Final = (
@@ -93,9 +93,22 @@ def run_lora(args: argparse.Namespace, report: Callable[[str], None]) -> list[Pa
         OutputError: a file cannot be written; said before any training where possible.
     """
     settings, separate = settings_of(args), () if args.separate is None else parse_evs(args.separate)
+    if args.data is None:
+        raise OptionError("--data", None, "a folder of `lightprobe train data`")
+    outs = require_outputs(args, settings, separate)
+    return train_and_write(args, settings, PairShards(args.data), outs, separate, report)
+
+
+def require_outputs(args: argparse.Namespace, settings: LoraSettings, separate: Sequence[float] = ()) -> list[Path]:
+    """Make sure, before long work, that what is trained can be computed and written; the files, one a LoRA.
+
+    Raises:
+        OptionError: an option that is missing or not accepted.
+        OutputError: a file cannot be written.
+    """
     if settings.precision == "fp16" and not torch.cuda.is_available():
         raise OptionError("--mixed-precision", "fp16", "bf16 or no where there is no GPU")
-    for name in ("data", "out", "work"):
+    for name in ("out", "work"):
         if getattr(args, name) is None:
             raise OptionError(f"--{name}", None, "a path")
     if args.out.suffix != ".safetensors":
@@ -104,7 +117,18 @@ def run_lora(args: argparse.Namespace, report: Callable[[str], None]) -> list[Pa
     for out in outs:
         require_writable(out)
     require_work_folder(args.work)
-    pairs = PairShards(args.data)
+    return outs
+
+
+def train_and_write(
+    args: argparse.Namespace,
+    settings: LoraSettings,
+    pairs: PairShards,
+    outs: Sequence[Path],
+    separate: Sequence[float],
+    report: Callable[[str], None],
+) -> list[Path]:
+    """Load the model, train, write; returns the files, none from a process that does not write."""
     trained = train_exposure_loras(
         _base(args, settings), pairs, settings, args.work, separate=separate, report=_by_first_process(report)
     )

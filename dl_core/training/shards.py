@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -26,7 +26,16 @@ from ..imageio import atomic
 from .pair_sampler import PairSampler, Take
 from .pairs import pair_key
 
-__all__ = ["Shard", "clear_leftovers", "is_whole", "pair_members", "planned_shards", "write_shard"]
+__all__ = [
+    "Shard",
+    "clear_leftovers",
+    "is_whole",
+    "pair_members",
+    "planned_shards",
+    "png_bytes",
+    "write_pairs",
+    "write_shard",
+]
 
 SPLITS: Final = ("training", "validation")
 KINDS: Final = ("image.png", "mask.png", "depth.png", "json")
@@ -71,9 +80,9 @@ def pair_members(take: Take) -> dict[str, bytes]:
     """A pair's members by the end of their names."""
     ball = take.pair.ball
     contents = (
-        _png(take.pair.image[0]),
-        _png(disc_mask(ball, grow=ball.dilation)[0]),
-        _png(paint_depth(None, ball)[0, ..., 0]),
+        png_bytes(take.pair.image[0]),
+        png_bytes(disc_mask(ball, grow=ball.dilation)[0]),
+        png_bytes(paint_depth(None, ball)[0, ..., 0]),
         json.dumps(_record(take), sort_keys=True).encode(),
     )
     return dict(zip(KINDS, contents, strict=True))
@@ -91,7 +100,7 @@ def _record(take: Take) -> dict[str, Any]:
     }
 
 
-def _png(values: Float[Tensor, "h w *c"]) -> bytes:
+def png_bytes(values: Float[Tensor, "h w *c"]) -> bytes:
     """Display values in [0, 1] as 8 bits, grey or RGB."""
     file = io.BytesIO()
     PILImage.fromarray((values * 255).round().numpy().astype(np.uint8)).save(
@@ -107,11 +116,20 @@ def write_shard(folder: Path, shard: Shard, sampler: PairSampler) -> Path:
         OutputError: it cannot be written, such as on a full disk.
         ImageError: a panorama cannot be read any more.
     """
-    path = folder / shard.file
+    drawn = ((index, pair_members(sampler.take(index))) for index in shard.indices)
+    return write_pairs(folder / shard.file, drawn)
+
+
+def write_pairs(path: Path, pairs: Iterable[tuple[int, Mapping[str, bytes]]]) -> Path:
+    """Write pairs, each an index and its members by the ends of their names, as a tar file; whole or not there.
+
+    Raises:
+        OutputError: it cannot be written, such as on a full disk.
+    """
     try:
         with atomic(path) as temporary, tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
-            for index in shard.indices:
-                for kind, content in pair_members(sampler.take(index)).items():
+            for index, members in pairs:
+                for kind, content in members.items():
                     # Owner, rights and time are those of a fresh TarInfo: 0, rw-r--r-- and 1970.
                     member = tarfile.TarInfo(f"{pair_key(index)}.{kind}")
                     member.size = len(content)
