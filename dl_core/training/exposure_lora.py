@@ -6,7 +6,6 @@ Source: DiffusionLight, Sec. 4.2 (Eq. 4 and 5), Sec. 5, and the appendix on LoRA
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs
 from peft import LoraConfig
-from peft.utils import get_peft_model_state_dict, set_peft_model_state_dict
+from peft.utils import get_peft_model_state_dict
 from torch import Tensor, nn
 
 from ..backends.diffusers_lora import EXPOSURE, lora_shapes
@@ -26,16 +25,15 @@ from ..backends.diffusers_painter import DiffusersPainter, Guidance
 from ..backends.mini import ModelDefaults
 from ..errors import Interrupted, OptionError, OutputError
 from ..exposure_prompts import embedding_at
-from ..imageio import write_png
 from .denoiser import time_ids, weighted_error
 from .latent_cache import LatentCache, Pairs, data_fingerprint, encode_pairs
 from .lora_base import LoraBase
 from .lora_batches import LoraBatch, LoraBatches
-from .lora_checkpoint import LoraState, read_checkpoint, require_same, write_checkpoint
 from .lora_file import kohya_weights
+from .lora_keeper import CheckpointKeeper, LoraJob
 from .lora_log import TrainingLog
 from .lora_settings import SEPARATE_PROMPT, LoraSettings
-from .lora_validation import VALIDATION_EVS, Validation
+from .lora_validation import VALIDATION_EVS, Validation, ValidationPictures
 from .stopping import asked_to_stop
 
 __all__ = ["ATTENTION_LAYERS", "TrainedLora", "add_exposure_adapter", "train_exposure_loras"]
@@ -66,22 +64,6 @@ class TrainedLora:
     weights: dict[str, Tensor]
     metadata: dict[str, str]
     ev: float | None
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One LoRA to train: its folder, its exposure if it is for one alone, and what its result depends on."""
-
-    folder: Path
-    ev: float | None
-    identity: dict[str, str]
-
-    def resumed(self) -> LoraState | None:
-        """Where it stands; OptionError if the folder's checkpoint is of another training."""
-        state = read_checkpoint(self.folder)
-        if state is not None:
-            require_same(state, self.identity, self.folder)
-        return state
 
 
 @dataclass(frozen=True)
@@ -153,11 +135,11 @@ def train_exposure_loras(
     work.mkdir(parents=True, exist_ok=True)
     defaults = _prompted(base.defaults, settings, bool(separate))
     data, model = data_fingerprint(pairs), base.fingerprint()
-    told = {"the base model": f"{base.source} {model}", "the data": data, "the prompts": _prompts(defaults)}
+    told = {"the base model": model, "the data": data, "the prompts": _prompts(defaults)}
     told |= settings.decisive() | {"the number of processes": str(accelerator.num_processes)}
-    jobs = [_Job(work, None, told | {"--separate": "none"})]
+    jobs = [LoraJob(work, None, told | {"--separate": "none"})]
     if separate:
-        jobs = [_Job(work / f"ev{ev:g}", ev, told | {"--separate": f"{ev:g}"}) for ev in separate]
+        jobs = [LoraJob(work / f"ev{ev:g}", ev, told | {"--separate": f"{ev:g}"}) for ev in separate]
     for job in jobs:
         job.resumed()  # a checkpoint of another training is refused before the long work of encoding
     frozen = _freeze(accelerator, base, defaults, pairs, work / "latents", {"base": model, "data": data}, report)
@@ -255,12 +237,12 @@ def add_exposure_adapter(unet: Any, settings: LoraSettings) -> list[nn.Parameter
     return weights
 
 
-def _train(frozen: _Frozen, job: _Job, chosen: Tensor, settings: LoraSettings, report: Report) -> TrainedLora:
+def _train(frozen: _Frozen, job: LoraJob, chosen: Tensor, settings: LoraSettings, report: Report) -> TrainedLora:
     job.folder.mkdir(parents=True, exist_ok=True)
     accelerator, unet = frozen.accelerator, frozen.base.pipeline.unet
     weights = add_exposure_adapter(unet, settings)
     prepared, optimizer = accelerator.prepare(unet, torch.optim.AdamW(weights, lr=settings.learning_rate))
-    keeper = _Keeper(accelerator, unet, optimizer, job, settings, report)
+    keeper = CheckpointKeeper(accelerator, unet, optimizer, job, settings, report)
     batches = LoraBatches(
         frozen.cache,
         chosen,
@@ -277,7 +259,7 @@ def _train(frozen: _Frozen, job: _Job, chosen: Tensor, settings: LoraSettings, r
         return weighted_error(predicted, batch.target.to(predicted), batch.ball.to(predicted))
 
     step = keeper.resume()
-    look = _Look(frozen, job, settings) if settings.validate_every and accelerator.is_main_process else None
+    pictures = _pictures(frozen, job, settings)
     with _log(job.folder, step, accelerator, report) as log, asked_to_stop() as stop:
         while step < settings.steps:
             loss, stopped = _step(accelerator, prepared, optimizer, weights, loss_of_batch, step, settings, stop)
@@ -285,8 +267,8 @@ def _train(frozen: _Frozen, job: _Job, chosen: Tensor, settings: LoraSettings, r
             if log is not None:
                 log.step(step, loss, settings.rate(step - 1))
             keeper.after(step, loss)
-            if look is not None and log is not None and (step % settings.validate_every == 0 or step == settings.steps):
-                look.paint(step, log)
+            if pictures is not None and log is not None and _is_time(step, settings):
+                _show(pictures, step, log, report)
             if stopped and step < settings.steps:
                 kept = keeper.save(step)
                 raise Interrupted(f"training stopped at step {step}; {kept}; the same command goes on")
@@ -329,77 +311,23 @@ def _step(
     return mean, stopped > 0
 
 
-class _Keeper:
-    """Checkpoints of a job, by time; only the main process writes."""
-
-    def __init__(
-        self, accelerator: Accelerator, unet: Any, optimizer: Any, job: _Job, settings: LoraSettings, report: Report
-    ) -> None:
-        self._accelerator, self._unet, self._optimizer = accelerator, unet, optimizer
-        self._job, self._settings, self._report = job, settings, report
-        self._saved = self._spoken = time.monotonic()
-        self._kept: int | None = None
-
-    def resume(self) -> int:
-        """Take up the folder's checkpoint; the step it stands at."""
-        state = self._job.resumed()
-        if state is None:
-            return 0
-        set_peft_model_state_dict(self._unet, state.lora, adapter_name=EXPOSURE)
-        self._optimizer.load_state_dict(state.optimizer)
-        if state.scaler is not None and self._accelerator.scaler is not None:
-            self._accelerator.scaler.load_state_dict(state.scaler)
-        self._kept = state.step
-        self._report(f"going on from step {state.step}")
-        return state.step
-
-    def after(self, step: int, loss: float) -> None:
-        """Speak every ten seconds, and write a checkpoint when it is time."""
-        now = time.monotonic()
-        if self._accelerator.is_main_process and (now - self._spoken > 10 or step == self._settings.steps):
-            self._report(f"step {step}/{self._settings.steps}  loss {loss:.4f}")
-            self._spoken = now
-        if now - self._saved >= 60 * self._settings.checkpoint_minutes and step < self._settings.steps:
-            self.save(step)
-            self._saved = now
-
-    def save(self, step: int) -> str:
-        """Write a checkpoint; says which one there is now. A full disk costs the new one, not the old one."""
-        if not self._accelerator.is_main_process or self._kept == step:
-            return f"the checkpoint is of step {step}"
-        scaler = self._accelerator.scaler
-        lora = get_peft_model_state_dict(self._unet, adapter_name=EXPOSURE)
-        state = LoraState(
-            self._job.identity,
-            step,
-            {name: weight.detach().cpu() for name, weight in lora.items()},
-            self._optimizer.state_dict(),
-            None if scaler is None else scaler.state_dict(),
-        )
-        try:
-            write_checkpoint(self._job.folder, state)
-        except OutputError as error:
-            kept = "there is none yet" if self._kept is None else f"the one of step {self._kept} is kept"
-            self._report(f"the checkpoint of step {step} was not written ({error.reason}); {kept}")
-            return kept if self._kept is None else f"the checkpoint is of step {self._kept}"
-        self._kept = step
-        return f"the checkpoint is of step {step}"
+def _pictures(frozen: _Frozen, job: LoraJob, settings: LoraSettings) -> ValidationPictures | None:
+    if not settings.validate_every or not frozen.accelerator.is_main_process:
+        return None
+    evs = VALIDATION_EVS if job.ev is None else (job.ev,)
+    validation = Validation.of(frozen.painter, frozen.cache.canvas, tuple(ev for ev in evs if ev >= settings.ev_min))
+    return ValidationPictures(validation, job.folder / "pictures")
 
 
-class _Look:
-    """Pictures of validation, as files and in the log."""
+def _show(pictures: ValidationPictures, step: int, log: TrainingLog, report: Report) -> None:
+    try:
+        log.picture(pictures.title, pictures.paint(step), step)
+    except OutputError as error:
+        report(f"{error}; training goes on without this picture")
 
-    def __init__(self, frozen: _Frozen, job: _Job, settings: LoraSettings) -> None:
-        evs = VALIDATION_EVS if job.ev is None else (job.ev,)
-        self._evs = tuple(ev for ev in evs if ev >= settings.ev_min)
-        self._validation = Validation.of(frozen.painter, frozen.cache.canvas, self._evs)
-        self._folder = job.folder / "pictures"
 
-    def paint(self, step: int, log: TrainingLog) -> None:
-        self._folder.mkdir(exist_ok=True)
-        sheet = self._validation.sheet()
-        write_png(self._folder / f"step-{step:06d}.png", sheet[0])
-        log.picture("balls at EV " + ", ".join(f"{ev:g}" for ev in self._evs), sheet, step)
+def _is_time(step: int, settings: LoraSettings) -> bool:
+    return step % settings.validate_every == 0 or step == settings.steps
 
 
 @contextmanager
@@ -415,10 +343,10 @@ def _log(folder: Path, step: int, accelerator: Accelerator, report: Report) -> A
         log.close()
 
 
-def _metadata(frozen: _Frozen, job: _Job, settings: LoraSettings) -> dict[str, str]:
+def _metadata(frozen: _Frozen, job: LoraJob, settings: LoraSettings) -> dict[str, str]:
     defaults = frozen.painter.defaults
     return {
-        "base": job.identity["the base model"],
+        "base": f"{frozen.base.source} {job.identity['the base model']}",
         "rank": str(settings.rank),
         "ev_min": f"{settings.ev_min:g}",
         "steps": str(settings.steps),

@@ -13,11 +13,11 @@ from torch import Tensor
 from ..backends.diffusers_lora import EXPOSURE
 from ..backends.diffusers_painter import DiffusersPainter
 from ..ball import Ball, fit_canvas, paint_depth, place_ball
-from ..imageio import read_photograph
+from ..imageio import read_photograph, write_png
 from ..painter import PaintRequest, SilentObserver
 from ..shapes import Image
 
-__all__ = ["PHOTOGRAPH", "VALIDATION_EVS", "Validation"]
+__all__ = ["PHOTOGRAPH", "VALIDATION_EVS", "Validation", "ValidationPictures"]
 
 PHOTOGRAPH: Final = Path(__file__).resolve().parent.parent / "data" / "photos" / "coffee.jpg"
 VALIDATION_EVS: Final = (0.0, -2.5, -5.0)
@@ -70,3 +70,32 @@ class Validation:
             unet.set_adapters(EXPOSURE, 1.0)
             unet.train(training)
         return torch.cat(balls, dim=2)
+
+
+@dataclass(frozen=True)
+class ValidationPictures:
+    """Sheets as files.
+
+    Attributes:
+        validation: paints them.
+        folder: for them; made when it is needed.
+    """
+
+    validation: Validation
+    folder: Path
+
+    @property
+    def title(self) -> str:
+        """What a sheet shows."""
+        return "balls at EV " + ", ".join(f"{ev:g}" for ev in self.validation.evs)
+
+    def paint(self, step: int) -> Float[Tensor, "1 d w 3"]:
+        """Paint a sheet, write it as `step-000500.png`, and give it back.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        self.folder.mkdir(exist_ok=True)
+        sheet = self.validation.sheet()
+        write_png(self.folder / f"step-{step:06d}.png", sheet[0])
+        return sheet
