@@ -34,7 +34,8 @@ def run_turbo(args: argparse.Namespace, report: Callable[[str], None]) -> list[P
     if chosen.rounds.rounds == 0:
         raise OptionError("--preset", args.preset, "one that takes a median: draft, balanced or paper")
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise OptionError("torchrun", os.environ["WORLD_SIZE"], "one process: medians are painted by one")
+        then = "then `train lora --data WORK/medians --timesteps 800-999` takes any number"
+        raise OptionError("torchrun", os.environ["WORLD_SIZE"], f"one process while medians are painted; {then}")
     outs = require_outputs(args, settings)
     named = {f"--{name}": str(getattr(args, name)) for name in ("model", "controlnet", "lora", "depth", "preset")}
     rounds = replace(chosen.rounds, final=False)  # the last ball is painted from the median, which is what is wanted
