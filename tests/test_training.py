@@ -246,6 +246,12 @@ def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
         panorama_files(tmp_path, "training")
 
 
+def test_only_base_and_control_go_on_from_weights(tmp_path: Path) -> None:
+    options = argparse.Namespace(stage="vae", work=tmp_path, out=tmp_path, seed=1, go_on=True)
+    with pytest.raises(OptionError, match="--go-on is 'vae'; accepted: the stages base and control"):
+        run_stage(options, lambda line: None)
+
+
 def test_a_work_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     options = argparse.Namespace(stage="base", work=tmp_path / "file" / "work", out=tmp_path, seed=1)

@@ -42,6 +42,10 @@ SKETCH_ROWS: Final = 128
 """Rows of the maps behind half-size pictures."""
 
 
+GOING_ON: Final = ("base", "control")
+"""Stages that can start from weights that are there."""
+
+
 def _sampler(
     args: argparse.Namespace, model: MiniModel, *, scale: int = SKETCH, bracket: bool = False, centred: float = 0.7
 ) -> SceneSampler:
@@ -130,5 +134,7 @@ def run_stage(args: argparse.Namespace, report: Report) -> list[Path]:
     args.out = args.out or MINI_FOLDER
     require_writable(args.out / "mini.json")
     require_work_folder(args.work)
+    if args.go_on and args.stage not in GOING_ON:
+        raise OptionError("--go-on", args.stage, "the stages " + " and ".join(GOING_ON))
     torch.manual_seed(args.seed)  # random starts: a resumed run builds the same ones
     return _STAGES[args.stage](args, report)
