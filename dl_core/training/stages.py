@@ -11,6 +11,7 @@ from typing import Final
 import torch
 
 from ..backends.mini import LORA_FILE, MINI_FOLDER, MiniModel, load_mini
+from ..errors import OptionError
 from ..imageio import require_writable
 from .base import train_base
 from .control import train_control
