@@ -381,8 +381,9 @@ def test_two_processes_train_as_one_that_accumulates_two_batches(script: Path, t
     two = load_file(tmp_path / "two" / "lora.safetensors")
     assert two.keys() == one.keys()
     for key in one:
-        # Gradients are summed in another order, and Adam divides them by their size.
-        torch.testing.assert_close(two[key], one[key], atol=1e-4, rtol=1e-3)
+        # Gradients are summed in another order, and Adam divides them by their size, which is next to nothing for some;
+        # as a whole a matrix comes out the same, where other pictures would give another one.
+        assert (two[key] - one[key]).norm() < 0.01 * one[key].norm()
     shared, alone = logged(tmp_path / "two"), logged(tmp_path / "one")
     assert [line["step"] for line in shared] == [1, 2, 3, 4]  # the second process stays silent
     assert [line["loss"] for line in shared] == pytest.approx([line["loss"] for line in alone], rel=1e-3)
