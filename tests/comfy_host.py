@@ -26,6 +26,16 @@ from types import ModuleType
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+WORKFLOWS = (
+    "mini_quickstart",
+    "paper_sdxl",
+    "sdxl_fast",
+    "base_only",
+    "lora_only",
+    "turbo",
+    "spatially_varying",
+    "batch_folder",
+)
 COMFYUI = Path(os.environ.get("COMFYUI_PATH", Path.home() / "ComfyUI"))
 STANDIN = REPOSITORY / "tests" / "comfyui" / "standin"
 PHOTO = REPOSITORY / "dl_core" / "data" / "photos" / "coffee.jpg"

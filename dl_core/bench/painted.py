@@ -20,22 +20,13 @@ from ..imageio import read_envmap, read_exr_header
 from ..presets import Preset, preset
 from .baselines import BASELINES, answer_maps, open_baselines
 from .cameras import CAMERAS
-from .journal import fingerprint
-from .painters import PAINTERS, open_studio
+from .painters import PAINTERS, add_files, identity, open_studio
 from .paintings import VARIANTS, Painting, paint_maps, planned
 from .published import PUBLISHED
 from .report import Column, Report, Row, panorama_files, prepare_output, publish, table
 from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "run"]
-
-
-_FILES: Final = {
-    "model": "checkpoint",
-    "controlnet": "depth ControlNet",
-    "lora": "exposure LoRA",
-    "turbo-lora": "Turbo LoRA",
-}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,8 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--regressor", type=Path, metavar="DIR", help="the regressor's files, of `lightprobe train mini regressor`")
     add("--preset", default="draft", help="schedule and bracket (default: draft)")
     add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
-    for name, what in _FILES.items():
-        add(f"--{name}", metavar="PATH", help=f"{what} of the painter, as for estimate")
+    add_files(group)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -74,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
     baselines = open_baselines(compared, args.regressor, replace(settings, evs=chosen.evs))
     paint_maps(
-        paintings, studio.painter_of, chosen, settings, args.out, painter=_identity(args.painter, files), report=_say
+        paintings, studio.painter_of, chosen, settings, args.out, painter=identity(args.painter, files), report=_say
     )
     answer_maps(answers, baselines, args.out, report=_say)
     rows = [row for painting in (*paintings, *answers) for row in _score(painting, args)]
@@ -93,12 +83,6 @@ def run(args: argparse.Namespace) -> int:
             "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
         )
     return 0
-
-
-def _identity(painter: str, files: ModelFiles) -> str:
-    """Name of a painter, with a fingerprint of its files if it has any."""
-    places = (files.model, files.controlnet, files.lora, files.turbo_lora)
-    return f"{painter} {fingerprint(*places)}" if any(places) else painter
 
 
 def _say(line: str) -> None:

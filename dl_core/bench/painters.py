@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -11,10 +12,18 @@ from ..backends.loading import BACKENDS, LoadedPainter, ModelFiles
 from ..errors import OptionError
 from ..painter import Painter
 from .cameras import Shot
+from .journal import fingerprint
 from .paintings import PainterOf, Variant
 from .perfect import PerfectPainter
 
-__all__ = ["PAINTERS", "Studio", "open_studio"]
+__all__ = ["PAINTERS", "Studio", "add_files", "identity", "open_studio"]
+
+_FILES: Final = {
+    "model": "checkpoint",
+    "controlnet": "depth ControlNet",
+    "lora": "exposure LoRA",
+    "turbo-lora": "Turbo LoRA",
+}
 
 
 @dataclass(frozen=True)
@@ -56,6 +65,18 @@ PAINTERS: Final[dict[str, Callable[[ModelFiles], Studio]]] = {
     **{name: _backend(name) for name in BACKENDS},
 }
 """Painters by name: files -> studio. `perfect` paints the true ball in 8 bits, whatever the files."""
+
+
+def add_files(parser: argparse._ActionsContainer) -> None:
+    """Declare the options that name a painter's files, as `ModelFiles.of` reads them."""
+    for name, what in _FILES.items():
+        parser.add_argument(f"--{name}", metavar="PATH", help=f"{what} of the painter, as for estimate")
+
+
+def identity(painter: str, files: ModelFiles) -> str:
+    """Name of a painter, with a fingerprint of its files if it has any."""
+    places = (files.model, files.controlnet, files.lora, files.turbo_lora)
+    return f"{painter} {fingerprint(*places)}" if any(places) else painter
 
 
 def open_studio(name: str, files: ModelFiles) -> Studio:

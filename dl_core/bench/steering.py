@@ -33,8 +33,8 @@ from ..painter import PaintRequest
 from ..presets import preset
 from ..shapes import BallImage
 from .cameras import Camera, take
-from .journal import Journal, fingerprint
-from .painters import PAINTERS, Studio, open_studio
+from .journal import Journal
+from .painters import PAINTERS, Studio, add_files, identity, open_studio
 from .paintings import VARIANTS
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 
@@ -62,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--structure-ev", type=float, default=-2.5, help="EV whose edges are compared with EV 0's (default: -2.5)")
     add("--preset", default="draft", help="schedule of each exposure (default: draft)")
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
-    for name in ("model", "controlnet", "lora", "turbo-lora"):
-        add(f"--{name}", metavar="PATH", help="file of the painter, as for estimate")
+    add_files(parser)
     add_output(parser)
 
 
@@ -81,17 +80,17 @@ def run(args: argparse.Namespace) -> None:
     rounds = preset(args.preset).rounds
     prepare_output(args)
     models = ModelFiles.of(args)
-    identity = {
+    run_identity = {
         "bench": "steering",
         "panoramas": [path.stem for path in files],
         "evs": list(evs),
         "preset": args.preset,
         "seed": args.seed,
         "structure_ev": args.structure_ev,
-        "painter": f"{args.painter} {fingerprint(models.model, models.controlnet, models.lora, models.turbo_lora)}",
+        "painter": identity(args.painter, models),
     }
     studio = open_studio(args.painter, models)
-    journal = Journal(args.out, identity, len(evs))
+    journal = Journal(args.out, run_identity, len(evs))
     rows = bench_steering(files, studio, evs, rounds, args.structure_ev, seed=args.seed, journal=journal)
     protocol = {
         "painter": args.painter,

@@ -10,23 +10,13 @@ from pathlib import Path
 
 import pytest
 from browser.chromium import CHROMIUM, NO_CHROMIUM, Page, open_page
-from comfy_host import NO_COMFYUI, REPOSITORY, Server, installed, serve
+from comfy_host import NO_COMFYUI, REPOSITORY, WORKFLOWS, Server, installed, serve
 
 pytestmark = [
     pytest.mark.skipif(not installed(), reason=NO_COMFYUI),
     pytest.mark.skipif(CHROMIUM is None, reason=NO_CHROMIUM),
 ]
 
-WORKFLOWS = (
-    "mini_quickstart",
-    "paper_sdxl",
-    "sdxl_fast",
-    "base_only",
-    "lora_only",
-    "turbo",
-    "spatially_varying",
-    "batch_folder",
-)
 
 DIALOGS = """[...document.querySelectorAll('[role=dialog], .comfy-modal')]
     .filter(element => element.offsetParent !== null).map(element => element.innerText)"""

@@ -12,21 +12,11 @@ from typing import Any
 
 import pytest
 import torch
-from comfy_host import PHOTO, REPOSITORY, Server, pack_module
+from comfy_host import PHOTO, REPOSITORY, WORKFLOWS, Server, pack_module
 from depth_models import save_depth_anything
 from lora_files import RandomLora, attention_layers
 from safetensors.torch import save_file
 
-WORKFLOWS = (
-    "mini_quickstart",
-    "paper_sdxl",
-    "sdxl_fast",
-    "base_only",
-    "lora_only",
-    "turbo",
-    "spatially_varying",
-    "batch_folder",
-)
 WIDGETS = ("INT", "FLOAT", "STRING", "BOOLEAN", "COMBO")
 FILE_INPUTS = {
     ("LoadImage", "image"),
