@@ -9,7 +9,7 @@ camera (visualized as white) and in an inpaint mask").
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -69,6 +69,11 @@ class Ball:
     def centre(self) -> tuple[float, float]:
         """(x, y) of the centre in canvas coordinates."""
         return self.left + self.diameter / 2, self.top + self.diameter / 2
+
+    def enlarged(self, factor: int) -> Ball:
+        """The same ball on a canvas so many times as large."""
+        lengths = ("left", "top", "diameter", "canvas", "dilation")
+        return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
 
 def place_ball(

@@ -19,13 +19,15 @@ from torch import Tensor, nn
 
 from dl_core.backends.diffusers_painter import DiffusersPainter
 from dl_core.backends.mini import LORA_FILE, MINI_FOLDER, NETWORK_FILES, MiniModel, load_mini
+from dl_core.ball import disc_mask
 from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
 from dl_core.geometry import latlong_energy
 from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
 from dl_core.training.control import train_control
 from dl_core.training.decoder import train_decoder
-from dl_core.training.denoiser import BLIND_ABOVE, BLIND_FROM, draw_batch
+from dl_core.training.denoiser import BLIND_ABOVE, BLIND_FROM, OFF_BALL_WEIGHT, draw_batch
+from dl_core.training.drawn_pairs import DrawnPairs
 from dl_core.training.export import write_networks
 from dl_core.training.loop import Budget, train
 from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
@@ -133,7 +135,7 @@ def test_a_batch_mixes_signal_and_noise_as_its_timesteps_say(panoramas: Tensor) 
     assert torch.equal(batch.noisy, again.noisy)
     assert batch.noisy.shape == (6, 4, 16, 16)
     assert batch.balls[0].canvas == 128
-    assert batch.weights.min() == pytest.approx(0.3)
+    assert batch.weights.min() == pytest.approx(OFF_BALL_WEIGHT)
     assert batch.weights.max() == pytest.approx(1.0)
 
 
@@ -184,6 +186,32 @@ def test_a_killed_training_resumes_bit_for_bit(tmp_path: Path) -> None:
     assert steps[-1] == 40
 
 
+def test_bfloat16_is_for_the_products_alone(tmp_path: Path) -> None:
+    line = _Line()
+    seen = set()
+
+    def loss(step: int) -> Tensor:
+        product = torch.ones(1, 2) @ line.slope[:, None]
+        seen.add(product.dtype)
+        return (product.float() - 3).square().mean()
+
+    weights = train({"line": line}, loss, Budget(60, 0.1, warmup=3, bf16=True), tmp_path, report=lambda text: None)
+    assert seen == {torch.bfloat16}
+    assert weights["line"]["slope"].dtype == torch.float32
+    assert float(weights["line"]["slope"].sum()) == pytest.approx(3, abs=0.2)
+
+
+def test_pairs_drawn_small_have_the_latents_of_large_ones(panoramas: Tensor) -> None:
+    sampler = SceneSampler(panoramas, 64, 32, seed=3, bracket=True, centred=0.0)
+    pair, picture = DrawnPairs(sampler, 4, scale=2)[2], sampler.draw(2)
+    assert pair.ball.canvas == pair.image.shape[1] == 128
+    torch.testing.assert_close(block_latents(pair.image, 8), block_latents(picture.canvas_ldr, 4))
+    assert pair.ball.centre == tuple(2 * length for length in picture.ball.centre)
+    assert float(disc_mask(pair.ball).sum() / disc_mask(picture.ball).sum()) == pytest.approx(4, rel=0.02)
+    with pytest.raises(IndexError):
+        DrawnPairs(sampler, 2)[2]
+
+
 @pytest.mark.parametrize(("steps", "rate", "named"), [(0, 1e-3, "steps"), (10, 0.0, "learning rate")])
 def test_budgets_that_make_no_sense_are_refused(steps: int, rate: float, named: str) -> None:
     with pytest.raises(OptionError, match=named):
@@ -209,11 +237,11 @@ def test_the_stage_lora_writes_a_lora_of_attentions_that_loads_into_the_painter(
     folder.mkdir()
     for name in ("mini.json", "tokenizer", *NETWORK_FILES.values()):
         (folder / name).symlink_to(MINI_FOLDER / name)
-    draw_scenes(scenes, "drawn", 1, 256, report=lambda text: None)
+    draw_scenes(scenes, "drawn", 1, 128, report=lambda text: None)
     options = argparse.Namespace(
         stage="lora", out=folder, work=tmp_path / "work", panoramas=None, scenes=scenes, steps=2, batch=1
     )
-    options.learning_rate, options.seed, options.go_on = 1e-3, 1, False
+    options.learning_rate, options.seed, options.go_on, options.mixed_precision = 1e-3, 1, False, "no"
     assert run_stage(options, lambda text: None) == [folder / LORA_FILE]
     model = load_mini(folder)
     assert model.lora is not None

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..backends.mini import MiniModel
-from .denoiser import TextBank, draw_batch, time_ids, velocity_loss
+from .denoiser import TextBank, draw_batch, spell_out_attention, time_ids, velocity_loss
 from .loop import Budget, train
 from .scenes import SceneSampler
 
@@ -40,6 +40,7 @@ def train_base(
     Returns:
         Averaged weights by network name.
     """
+    spell_out_attention(model.unet)
     bank = TextBank(model)
     side = model.defaults.canvas
 

@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 
 from ..backends.mini import MiniModel
 from ..ball import Ball, paint_depth
-from .denoiser import TextBank, draw_batch, time_ids, velocity_loss
+from .denoiser import TextBank, draw_batch, spell_out_attention, time_ids, velocity_loss
 from .loop import Budget, train
 from .scenes import SceneSampler
 
@@ -23,7 +23,7 @@ __all__ = ["train_control"]
 
 WITHOUT: Final = 0.1
 """Share of steps without the ControlNet, so that the base still works alone."""
-NOISIEST: Final = 0.6
+NOISIEST: Final = 0.75
 """Share of the noisiest levels: there the ball's place and the scene's light are settled."""
 _HINT: Final = "controlnet_cond_embedding."
 
@@ -51,6 +51,8 @@ def train_control(
     control: Any = model.controlnet
     if fresh:
         control.load_state_dict(ControlNetModel.from_unet(model.unet).state_dict(), strict=False)
+    for network in (model.unet, control):
+        spell_out_attention(network)
     looking = control.controlnet_cond_embedding
     features = _Features(looking)
     # The trained part takes features in place of a picture, so that those of the usual ball are computed once.

@@ -17,10 +17,12 @@ class DrawnPairs:
     Attributes:
         sampler: draws brackets.
         count: how many pairs there are.
+        scale: every pixel that is drawn becomes so many across and down; blocks of 8 keep their means.
     """
 
     sampler: SceneSampler
     count: int
+    scale: int = 1
 
     def __len__(self) -> int:
         return self.count
@@ -30,4 +32,7 @@ class DrawnPairs:
         if not 0 <= index < self.count:
             raise IndexError(f"pair {index} of {self.count}")
         picture = self.sampler.draw(index)
-        return Pair(picture.canvas_ldr, picture.ball, picture.ev, "drawn")
+        pixels = picture.canvas_ldr
+        for axis in (1, 2):
+            pixels = pixels.repeat_interleave(self.scale, dim=axis)
+        return Pair(pixels, picture.ball.enlarged(self.scale), picture.ev, "drawn")

@@ -26,19 +26,21 @@ __all__ = ["Budget", "average_weights", "train"]
 
 @dataclass(frozen=True)
 class Budget:
-    """How long to train and how fast.
+    """How long to train, how fast, and in what precision.
 
     Attributes:
         steps: optimizer steps in all.
         learning_rate: at the end of the warm-up; it falls to zero along a cosine.
         warmup: steps of linear warm-up.
         checkpoint_seconds: time between checkpoints.
+        bf16: compute losses under autocast to bfloat16; weights, averages and optimizer stay in single precision.
     """
 
     steps: int
     learning_rate: float
     warmup: int = 50
     checkpoint_seconds: float = 120.0
+    bf16: bool = False
 
     def __post_init__(self) -> None:
         if self.steps < 1:
@@ -111,7 +113,8 @@ def train(
         while step < budget.steps:
             for group in optimizer.param_groups:
                 group["lr"] = budget.rate(step)
-            loss = loss_of_step(step * processes.num_processes + processes.process_index)
+            with torch.autocast(processes.device.type, torch.bfloat16, enabled=budget.bf16):
+                loss = loss_of_step(step * processes.num_processes + processes.process_index)
             loss.backward()  # type: ignore[no-untyped-call]
             if processes.num_processes > 1:
                 _share_gradients(weights)

@@ -61,6 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--learning-rate", type=float, help="peak learning rate (default: the stage's)")
     add("--seed", type=int, default=1, help="of weights and pictures (default: 1)")
     add(
+        "--mixed-precision",
+        choices=("no", "bf16"),
+        default="no",
+        help="of all stages' networks; bf16 is 1.7 times as fast where the processor has AMX (default: no)",
+    )
+    add(
         "--go-on",
         action="store_true",
         help="start from the weights in --out, with fresh averages, instead of from random ones (base, control)",

@@ -18,7 +18,7 @@ from ..exposure_prompts import embedding_at
 from ..prompts import DARK_PROMPT, PROMPT
 from .autoencoder import block_latents
 from .base import wake_text_encoders
-from .denoiser import TextBank, latent_disc, time_ids
+from .denoiser import TextBank, latent_disc, spell_out_attention, time_ids
 from .loop import Budget, train
 from .scenes import BASE_CAPTIONS, SceneSampler
 
@@ -49,6 +49,7 @@ def train_regressor(
     Returns:
         Averaged weights by network name.
     """
+    spell_out_attention(model.unet)
     bank, side = TextBank(model), model.defaults.canvas
     original, dark = BASE_CAPTIONS.index(PROMPT), BASE_CAPTIONS.index(DARK_PROMPT)
     blocks = 8 * sampler.canvas // side

@@ -35,6 +35,10 @@ BASE_CAPTIONS: Final = (PROMPT, DARK_PROMPT, NEGATIVE_PROMPT, "")
 
 ASPECTS: Final = (1.0, 4 / 3, 3 / 2, 16 / 9, 3 / 4, 2 / 3)
 """Width over height of the photographs."""
+TINT: Final = 0.2
+"""Deviation of the random white balance of panoramas, in natural logarithms of each channel. Few maps have few colours
+of light; with this, the ball's colour has to be taken from the photograph."""
+
 Look = Literal["mirror", "disco", "matte", "tinted"]
 
 
@@ -119,7 +123,7 @@ class SceneSampler:
         panorama = self.panoramas[int(torch.randint(len(self.panoramas), (), generator=generator))][None]
         if _uniform(generator, 0, 1) < 0.5:
             panorama = panorama.flip(2)
-        return panorama * torch.exp(0.12 * torch.randn(3, generator=generator))
+        return panorama * torch.exp(TINT * torch.randn(3, generator=generator))
 
     def _photograph(self, generator: Generator, panorama: Tensor, rotation: Tensor) -> Image:
         """The scene fitted into the canvas with black bars, as a photograph of some aspect would be; radiance."""

@@ -58,7 +58,7 @@ def _sampler(
 
 
 def _budget(args: argparse.Namespace) -> Budget:
-    return Budget(args.steps, args.learning_rate)
+    return Budget(args.steps, args.learning_rate, bf16=args.mixed_precision == "bf16")
 
 
 def _vae(args: argparse.Namespace, report: Report) -> list[Path]:
@@ -100,12 +100,13 @@ def _regressor(args: argparse.Namespace, report: Report) -> list[Path]:
 
 def _lora(args: argparse.Namespace, report: Report) -> list[Path]:
     model = load_mini(args.out, without=("controlnet",))
-    pairs = DrawnPairs(_sampler(args, model, scale=1, bracket=True), args.steps * args.batch)
+    pairs = DrawnPairs(_sampler(args, model, bracket=True), args.steps * args.batch, SKETCH)
     settings = replace(
         LORA_SETTINGS["mini"],
         steps=args.steps,
         batch=args.batch,
         learning_rate=args.learning_rate,
+        precision=args.mixed_precision,
         ev_min=model.defaults.ev_min,
         seed=args.seed,
     )
