@@ -205,7 +205,7 @@ def test_pairs_drawn_small_have_the_latents_of_large_ones(panoramas: Tensor) -> 
     sampler = SceneSampler(panoramas, 64, 32, seed=3, bracket=True, centred=0.0)
     pair, picture = DrawnPairs(sampler, 4, scale=2)[2], sampler.draw(2)
     assert pair.ball.canvas == pair.image.shape[1] == 128
-    torch.testing.assert_close(block_latents(pair.image, 8), block_latents(picture.canvas_ldr, 4))
+    torch.testing.assert_close(block_latents(pair.image, 8), block_latents(picture.canvas_ldr, 4), atol=5e-4, rtol=0)
     assert pair.ball.centre == tuple(2 * length for length in picture.ball.centre)
     assert float(disc_mask(pair.ball).sum() / disc_mask(picture.ball).sum()) == pytest.approx(4, rel=0.02)
     with pytest.raises(IndexError):
