@@ -20,12 +20,16 @@ class Preset:
         evs: exposure values, descending from 0.
         summary: one line for people.
         depth_disc: of `ball.DEPTH_DISCS`; the authors' where a preset reproduces their runs.
+        error_deg: measured angular error, degrees: the mean over the three spheres and the maps in `data/hdri`, of the
+            mini model, as `lightprobe bench pareto --panoramas dl_core/data/hdri` prints it. None where the mini
+            model has no say: what needs a LoRA that it has not.
     """
 
     rounds: Rounds
     evs: tuple[float, ...]
     summary: str
     depth_disc: str = "ball"
+    error_deg: float | None = None
 
     @property
     def guided_steps(self) -> int:

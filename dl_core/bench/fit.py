@@ -142,7 +142,7 @@ def bench_fit(
     journal = journal or Journal(None, {}, len(faults))
     nominal = place_ball(CANVAS, DIAMETER)
     for path in panoramas:
-        if path.stem in journal.done:
+        if journal.has(path.stem):
             continue
         latlong = read_envmap(path)
         photo = latlong_to_perspective(latlong, CANVAS, CANVAS, fov=FOV, samples=1)

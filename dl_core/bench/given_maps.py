@@ -65,9 +65,8 @@ def run(args: argparse.Namespace) -> int:
     prepare_output(args)
     started = time.perf_counter()
     journal = Journal(args.out, _identity(args), len(PROTOCOLS[args.protocol].parts))
-    done = journal.done
     for predicted, truth in pairs:
-        if predicted.stem not in done:
+        if not journal.has(predicted.stem):
             maps = read_envmap(predicted), read_envmap(truth)
             begun = time.perf_counter()
             rows = score_maps(*maps, args.protocol, args.convention)

@@ -27,28 +27,31 @@ class Journal:
     Args:
         folder: of the run, which can be written to; None keeps rows in memory only.
         identity: what has to be the same for a run to be gone on with, as JSON keeps it.
-        each: rows of a panorama.
+        each: rows of a unit of work.
+        unit: labels in a row that say which unit it is of; a unit is measured whole or not at all.
 
     Raises:
         OutputError: the folder holds rows of a run with another identity; they stay as they are.
     """
 
-    def __init__(self, folder: Path | None, identity: Row, each: int) -> None:
+    def __init__(
+        self, folder: Path | None, identity: Row, each: int = 1, *, unit: tuple[str, ...] = ("panorama",)
+    ) -> None:
+        self._unit = unit
         self.path = None if folder is None else folder / "rows.jsonl"
         self.rows: list[Row] = []
         if self.path is not None:
-            self.rows = _whole(_resume(self.path, identity), each)
+            self.rows = self._whole(_resume(self.path, identity), each)
             lines = [identity, *self.rows]
-            # Lines of a panorama that was being written when the run was stopped go.
+            # Lines of a unit that was being written when the run was stopped go.
             self.path.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
 
-    @property
-    def done(self) -> set[str]:
-        """Names of the panoramas whose rows are there."""
-        return {row["panorama"] for row in self.rows}
+    def has(self, *labels: str) -> bool:
+        """Whether the rows of a unit are there."""
+        return any(self._labels(row) == labels for row in self.rows)
 
     def add(self, rows: list[Row]) -> None:
-        """Keep the rows of a panorama; they are on the disk when this returns."""
+        """Keep the rows of a unit; they are on the disk when this returns."""
         self.rows += rows
         if self.path is None:
             return
@@ -56,6 +59,14 @@ class Journal:
             file.write("".join(json.dumps(row) + "\n" for row in rows))
             file.flush()
             os.fsync(file.fileno())
+
+    def _labels(self, row: Row) -> tuple[str, ...]:
+        return tuple(row[name] for name in self._unit)
+
+    def _whole(self, rows: list[Row], each: int) -> list[Row]:
+        """Rows of the units that have all of theirs."""
+        counts = Counter(map(self._labels, rows))
+        return [row for row in rows if counts[self._labels(row)] == each]
 
 
 def _resume(path: Path, identity: Row) -> list[Row]:
@@ -74,9 +85,3 @@ def _json_lines(path: Path) -> Iterator[Row]:
             yield dict(json.loads(line))
         except (ValueError, TypeError):
             return
-
-
-def _whole(rows: list[Row], each: int) -> list[Row]:
-    """Rows of the panoramas that have all of theirs."""
-    counts = Counter(row["panorama"] for row in rows)
-    return [row for row in rows if counts[row["panorama"]] == each]

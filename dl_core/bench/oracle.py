@@ -261,7 +261,7 @@ def bench_oracle(
         return latlong, latlong_to_ball(latlong, ball)
 
     for before, path in zip([panoramas[-1], *panoramas], panoramas, strict=False):
-        if path.stem not in journal.done:
+        if not journal.has(path.stem):
             other, (latlong, true_ball) = scene(before)[1], scene(path)
             own = seed + zlib.crc32(path.stem.encode())
             found = _recovered(true_ball, other, cases, latlong.shape[1], own)

@@ -142,7 +142,7 @@ def bench_steering(
     journal = journal or Journal(None, {}, len(evs))
     ball = place_ball(studio.canvas, studio.diameter)
     for path in panoramas:
-        if path.stem in journal.done:
+        if journal.has(path.stem):
             continue
         shot = take(read_envmap(path), Camera())
         painter = studio.painter_of(VARIANTS[STEERED], shot)

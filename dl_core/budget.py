@@ -1,0 +1,99 @@
+"""Time budgets: how long presets take on this machine, and the best that is ready in time.
+
+A short calibration paints a few balls with one denoising step and with several. What the steps add is the price of an
+evaluation; what is left is that of a ball: encoding, decoding, and whatever else a painting begins with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Final
+
+from .errors import OptionError
+from .iterative import Rounds, rounds_evaluations
+from .painter import Painter, PaintRequest, SilentObserver
+from .presets import PRESETS, Preset
+
+__all__ = ["Pace", "best_within", "calibrate", "painted_balls"]
+
+BALLS: Final = 4
+"""Balls of the calibration: painters work on about so many at once."""
+FEW: Final = 1
+MORE: Final = 3
+"""Steps of its two paintings."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a painter is on this machine.
+
+    Attributes:
+        evaluation: seconds of a denoiser evaluation.
+        ball: seconds of a ball beside its evaluations.
+    """
+
+    evaluation: float
+    ball: float
+
+    def seconds(self, painter: Painter, preset: Preset) -> float:
+        """How long painting a preset will take, at most."""
+        exposures = len(preset.evs)
+        evaluations = exposures * rounds_evaluations(painter, preset.rounds)
+        return evaluations * self.evaluation + exposures * painted_balls(preset.rounds) * self.ball
+
+
+def painted_balls(rounds: Rounds) -> int:
+    """Balls that a schedule paints at one exposure, at most."""
+    return 1 if rounds.rounds == 0 else rounds.balls * rounds.rounds + rounds.final
+
+
+def calibrate(painter: Painter, request: PaintRequest, clock: Callable[[], float] = perf_counter) -> Pace:
+    """Measure a painter's pace.
+
+    Args:
+        painter: to measure. A first painting that is not counted lets it load and warm up.
+        request: a canvas and a ball as they will be painted; seeds, steps and strength are chosen here.
+        clock: tells seconds.
+    """
+    seeds = tuple(range(BALLS))
+
+    def paint(steps: int) -> tuple[float, int]:
+        started = clock()
+        result = painter.paint(replace(request, seeds=seeds, steps=steps, strength=1.0), SilentObserver())
+        return clock() - started, result.evaluations
+
+    paint(FEW)
+    (short, few), (long, more) = paint(FEW), paint(MORE)
+    evaluation = max(0.0, long - short) / max(1, more - few)
+    return Pace(evaluation, max(0.0, short - few * evaluation) / BALLS)
+
+
+def best_within(
+    seconds: float, painter: Painter, pace: Pace, presets: Mapping[str, Preset] = PRESETS, option: str = "budget"
+) -> str:
+    """The preset with the smallest measured error among those that are ready in time.
+
+    Presets without a measured error, which are for other models, are left out.
+
+    Args:
+        seconds: for all painting.
+        painter: counts evaluations.
+        pace: of the painter here.
+        presets: to choose from.
+        option: what an error calls the budget.
+
+    Returns:
+        Its name.
+
+    Raises:
+        OptionError: not even the cheapest one is.
+    """
+    takes = {name: pace.seconds(painter, preset) for name, preset in presets.items() if preset.error_deg is not None}
+    ready = [name for name, needed in takes.items() if needed <= seconds]
+    if not ready:
+        cheapest = min(takes, key=lambda name: takes[name])
+        accepted = f"{takes[cheapest]:.1f} s or more: the cheapest preset, {cheapest}, takes that long here"
+        raise OptionError(option, f"{seconds:g} s", accepted)
+    return min(ready, key=lambda name: (presets[name].error_deg, takes[name]))
