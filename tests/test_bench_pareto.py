@@ -33,7 +33,7 @@ LIGHT = torch.exp(latlong_directions(64))[None]
 CANVAS, DIAMETER = 64, 32
 
 
-def studio(flaws: Flaws = Flaws(), painted: list[int] | None = None) -> Studio:
+def studio(flaws: Flaws, painted: list[int] | None = None) -> Studio:
     class Counted(AnalyticPainter):
         def paint(self, request: PaintRequest, observer: Any) -> Any:
             if painted is not None:
@@ -130,9 +130,7 @@ def test_a_grid_holds_the_presets_and_the_papers_own_points_once(name: str) -> N
     assert set(PRESETS) <= set(names)
     runs = [(schedule.preset.rounds, schedule.preset.evs) for schedule in schedules]
     assert len(set(runs)) == len(runs)
-    papers = {
-        (s.preset.rounds.balls, s.preset.rounds.rounds) for s in schedules if s.kind == "paper" or s.name == "paper"
-    }
+    papers = {(s.preset.rounds.balls, s.preset.rounds.rounds) for s in schedules if "paper" in (s.kind, s.name)}
     assert papers == {(balls, rounds) for balls in (5, 15, 30) for rounds in (1, 2)}
 
 
@@ -165,9 +163,7 @@ def test_the_report_keeps_its_contract(
         assert row["scenes"] == 2
     assert rows["dear"]["angular_error_deg"] < rows["cheap"]["angular_error_deg"]
     assert rows["cheap"]["on_front"]
-    assert [row["schedule"] for row in report["summary"]] == [
-        row["schedule"] for row in report["rows"] if row["on_front"]
-    ]
+    assert report["summary"] == [row for row in report["rows"] if row["on_front"]]
 
 
 def _steps(rounds: Rounds) -> int:

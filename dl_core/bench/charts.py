@@ -85,6 +85,7 @@ def _draw_panel(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
     front = sorted((row["nfe"], row[key]) for row, mark in zip(rows, marks, strict=True) if mark)
     if front:
         axes.plot(*zip(*front, strict=True), color="0.6", linewidth=1, zorder=1)
+    axes.ticklabel_format(axis="y", useOffset=False)
     axes.set_xscale("log")
     axes.set_xlabel("denoiser evaluations (NFE)")
     axes.set_ylabel(label)

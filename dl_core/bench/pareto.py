@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> None:
         evaluations=sum(row["nfe"] for row in measured),
     )
     if args.out is not None:
-        write_files(args.out, rows, f"{args.painter}, {len(files)} panoramas")
+        write_files(args.out, rows, f"{args.painter}, panoramas: {len(files)}")
     publish(report, args, rows=_columns(args.seconds_per_step))
 
 
