@@ -11,6 +11,9 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Final
 
+import torch
+
+from .ball import paint_depth, place_ball
 from .errors import OptionError
 from .iterative import Rounds, rounds_evaluations
 from .painter import Painter, PaintRequest, SilentObserver
@@ -49,19 +52,22 @@ def painted_balls(rounds: Rounds) -> int:
     return 1 if rounds.rounds == 0 else rounds.balls * rounds.rounds + rounds.final
 
 
-def calibrate(painter: Painter, request: PaintRequest, clock: Callable[[], float] = perf_counter) -> Pace:
+def calibrate(painter: Painter, canvas: int, diameter: int, clock: Callable[[], float] = perf_counter) -> Pace:
     """Measure a painter's pace.
 
     Args:
         painter: to measure. A first painting that is not counted lets it load and warm up.
-        request: a canvas and a ball as they will be painted; seeds, steps and strength are chosen here.
+        canvas: side of the canvas, pixels.
+        diameter: of the ball on it, pixels.
         clock: tells seconds.
     """
-    seeds = tuple(range(BALLS))
+    ball = place_ball(canvas, diameter)
+    grey = torch.full((1, canvas, canvas, 3), 0.5)
+    request = PaintRequest(grey, paint_depth(None, ball), ball, 0.0, tuple(range(BALLS)))
 
     def paint(steps: int) -> tuple[float, int]:
         started = clock()
-        result = painter.paint(replace(request, seeds=seeds, steps=steps, strength=1.0), SilentObserver())
+        result = painter.paint(replace(request, steps=steps), SilentObserver())
         return clock() - started, result.evaluations
 
     paint(FEW)

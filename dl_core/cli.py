@@ -57,6 +57,7 @@ class CommandModule(Protocol):
 COMMANDS: Final[dict[str, Command]] = {
     "estimate": Command("estimate the light of a photograph and write it as an EXR", ".commands.estimate"),
     "queue": Command("run a workflow over photographs on ComfyUI servers and collect the maps", ".commands.queue"),
+    "presets": Command("what each preset paints, costs and reaches", ".commands.presets"),
     "spheres": Command("show diffuse and mirror spheres under an environment map", ".commands.spheres"),
     "inspect": Command("print header, metadata and energy of an environment map", ".commands.inspect"),
     "bench": Command("measure stages of the method against the truth", ".bench.cli"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from .errors import OptionError
 from .iterative import Rounds
@@ -38,6 +38,17 @@ class Preset:
         later = int(r.steps * r.strength)
         each = r.steps if r.rounds == 0 else r.balls * (r.steps + later * (r.rounds - 1)) + later * r.final
         return each * len(self.evs)
+
+    def row(self, name: str) -> dict[str, Any]:
+        """What a table says of it."""
+        return {
+            "preset": name,
+            "EVs": ", ".join(f"{ev:g}" for ev in self.evs),
+            **{key: getattr(self.rounds, key) for key in ("balls", "rounds", "steps")},
+            "guided_steps": self.guided_steps,
+            "error_deg": self.error_deg,
+            "summary": self.summary,
+        }
 
 
 PAPER_EVS: Final = (0.0, -2.5, -5.0)

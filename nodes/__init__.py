@@ -15,6 +15,7 @@ from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .loaders import MiniProbeLoader
 from .photo_folder import LoadPhotoFolder
+from .speed_accuracy import SpeedAccuracyChart
 from .turbo import TurboLoRASwap
 
 __all__ = ["NODES", "LightProbeExtension"]
@@ -35,6 +36,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     EstimateLight,
     BallGrid,
     LoadPhotoFolder,
+    SpeedAccuracyChart,
     SaveEnvMap,
     LoadEnvMap,
 )

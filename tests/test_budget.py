@@ -54,7 +54,7 @@ PRESETS = {"cheap": preset(4.0), "good": preset(3.0, 5, 10), "bad": preset(5.0, 
 @given(evaluation=st.floats(1e-4, 1.0), ball=st.floats(0.0, 2.0))
 def test_calibration_tells_evaluations_from_balls(evaluation: float, ball: float) -> None:
     painter = Timed(evaluation, ball)
-    pace = calibrate(painter, REQUEST, painter.clock)
+    pace = calibrate(painter, 64, 32, painter.clock)
     assert pace.evaluation == pytest.approx(evaluation, rel=1e-6)
     assert pace.ball == pytest.approx(ball, rel=1e-6, abs=1e-6)
 

@@ -1,20 +1,38 @@
-"""Charts of benches, as PNG and SVG. matplotlib is an extra (`pip install comfyui-lightprobe[bench]`)."""
+"""Charts of benches, as PNG and SVG, or as a picture to show."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from ..imageio import atomic
 from .front import on_front
 from .report import Row
 
-__all__ = ["bar_chart", "cost_chart"]
+__all__ = ["Here", "bar_chart", "cost_chart", "cost_picture"]
 
 _MARKS: Final = {"preset": ("o", 60.0), "paper": ("s", 36.0), "swept": (".", 24.0)}
 """Marker and size by kind of schedule."""
+DPI: Final = 120
+
+
+@dataclass(frozen=True)
+class Here:
+    """A schedule that is pointed at.
+
+    Attributes:
+        nfe: its denoiser evaluations.
+        row: its figures, where it was measured.
+    """
+
+    nfe: float
+    row: Row | None
 
 
 def bar_chart(path: Path, bars: Sequence[tuple[str, Row]], key: str, title: str) -> list[Path]:
@@ -27,14 +45,12 @@ def bar_chart(path: Path, bars: Sequence[tuple[str, Row]], key: str, title: str)
         title: of the axis.
 
     Returns:
-        The files written; none, and a `UserWarning`, without matplotlib.
+        The files written.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    figure = _figure(figsize=(9, 1 + 0.25 * len(bars)), layout="constrained")
-    if figure is None:
-        return []
+    figure = Figure(figsize=(9, 1 + 0.25 * len(bars)), layout="constrained")
     axes = figure.subplots()
     places = range(len(bars))
     axes.barh(places, [line[f"{key}_median"] for _, line in bars], label="median")
@@ -58,16 +74,29 @@ def cost_chart(path: Path, rows: Sequence[Row], figures: Sequence[tuple[str, str
 
     Returns, Raises: as `bar_chart`.
     """
+    return _save(_cost_figure(rows, figures, title, None), path)
+
+
+def cost_picture(rows: Sequence[Row], figures: Sequence[tuple[str, str]], title: str, here: Here) -> np.ndarray:
+    """The chart of `cost_chart` with a schedule pointed at, as 8-bit RGB, (height, width, 3)."""
+    canvas = FigureCanvasAgg(_cost_figure(rows, figures, title, here))
+    canvas.figure.set_dpi(DPI)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _cost_figure(rows: Sequence[Row], figures: Sequence[tuple[str, str]], title: str, here: Here | None) -> Figure:
     columns = min(2, len(figures))
     lines = -(-len(figures) // columns)
-    figure = _figure(figsize=(6.5 * columns, 4.5 * lines), layout="constrained")
-    if figure is None:
-        return []
+    figure = Figure(figsize=(6.5 * columns, 4.5 * lines), layout="constrained")
     figure.suptitle(title)
     panels = figure.subplots(lines, columns, squeeze=False).flat
     for axes, (key, label) in zip(panels, figures, strict=False):
         _draw_panel(axes, [row for row in rows if row[key] is not None], key, label)
-    return _save(figure, path)
+        if here is not None:
+            _point_at(axes, here, key)
+        axes.legend(fontsize=7)
+    return figure
 
 
 def _draw_panel(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
@@ -89,22 +118,20 @@ def _draw_panel(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("denoiser evaluations (NFE)")
     axes.set_ylabel(label)
-    axes.legend(fontsize=7)
 
 
-def _figure(**options: Any) -> Any:
-    """A figure; None, and a warning, without matplotlib."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        warnings.warn("matplotlib is not installed (extra: bench), so no chart is drawn", stacklevel=3)
-        return None
-    return Figure(**options)
+def _point_at(axes: Any, here: Here, key: str) -> None:
+    """A star where the schedule was measured; else its cost alone is known, and a line shows that."""
+    error = None if here.row is None else here.row[key]
+    if error is None:
+        axes.axvline(here.nfe, color="tab:red", linestyle="--", linewidth=1, label="these settings, not measured")
+    else:
+        axes.scatter([here.nfe], [error], s=200, marker="*", color="tab:red", zorder=4, label="these settings")
 
 
-def _save(figure: Any, path: Path) -> list[Path]:
+def _save(figure: Figure, path: Path) -> list[Path]:
     written = [path.with_suffix(suffix) for suffix in (".png", ".svg")]
     for file in written:
         with atomic(file) as temporary:
-            figure.savefig(temporary, format=file.suffix[1:], dpi=120)
+            figure.savefig(temporary, format=file.suffix[1:], dpi=DPI)
     return written

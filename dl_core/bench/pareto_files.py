@@ -39,7 +39,7 @@ def write_files(folder: Path, rows: Sequence[Row], title: str) -> list[Path]:
         title: what the figures are of.
 
     Returns:
-        The files; without matplotlib the pictures are missing, and a `UserWarning` says so.
+        The files.
 
     Raises:
         OutputError: a file cannot be written.

@@ -1,0 +1,47 @@
+"""SpeedAccuracyChart: what a schedule costs, and what others reach for it."""
+
+from __future__ import annotations
+
+from comfy_api.latest import io
+
+from ..dl_core.exposure import check_evs
+from .painting import rounds_inputs, rounds_of
+from .sockets import CATEGORY, named_output, parse_evs
+
+__all__ = ["SpeedAccuracyChart"]
+
+
+class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
+    """Points at a schedule on the measured chart."""
+
+    @classmethod
+    def define_schema(cls) -> io.Schema:
+        """Sockets of the node."""
+        return io.Schema(
+            node_id="SpeedAccuracyChart",
+            display_name="Speed Accuracy Chart",
+            category=CATEGORY,
+            description="Shows the mini model's errors against denoiser evaluations, as `lightprobe bench pareto` "
+            "measured them, and these settings: a star, or a dashed line at their cost where they were not measured.",
+            inputs=[
+                *rounds_inputs("balanced"),
+                io.Int.Input("steps", default=30, min=1, max=998, tooltip="Denoising steps of a full schedule."),
+                io.String.Input("evs", default="0, -2.5, -5", tooltip="Exposures, descending from 0."),
+            ],
+            outputs=[
+                named_output(io.Image, "chart", "Four errors against evaluations; the line is the front."),
+                named_output(io.String, "report", "What these settings cost, and where they stand."),
+            ],
+        )
+
+    @classmethod
+    def execute(
+        cls, preset: str, balls: int, rounds: int, strength: float, final: bool, steps: int, evs: str
+    ) -> io.NodeOutput:
+        """Draw the chart."""
+        # matplotlib takes a second to import, which no other node should wait for.
+        from ..dl_core.bench.shipped_chart import chart_of
+
+        return io.NodeOutput(
+            *chart_of(rounds_of(preset, balls, rounds, strength, final, steps), check_evs(parse_evs(evs)))
+        )
