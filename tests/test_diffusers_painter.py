@@ -246,3 +246,39 @@ def test_missing_and_foreign_model_files_are_named(tmp_path: Path) -> None:
         DiffusersPainter.from_files(broken, broken)
     with pytest.raises(ModelError, match=r"broken\.safetensors"):
         read_weights(broken)
+
+
+def test_a_depth_map_is_seen_once_and_the_controlnet_is_left_as_it_was(
+    painter: DiffusersPainter, request_: PaintRequest
+) -> None:
+    looking, looked = painter.pipeline.controlnet.controlnet_cond_embedding, list[int]()
+    hook = looking.register_forward_hook(lambda module, inputs, output: looked.append(len(inputs[0])))
+    painter.paint(replace(request_, seeds=(1, 2, 3)), SilentObserver())
+    assert looked == [1]
+    with pytest.raises(Interrupted):
+        painter.paint(request_, _Stopping())
+    hook.remove()
+    assert painter.pipeline.controlnet.controlnet_cond_embedding is looking
+
+
+class _Stopping(SilentObserver):
+    def evaluated(self, count: int) -> None:
+        raise Interrupted("stopped")
+
+
+def test_the_photograph_and_a_composite_are_encoded_once(
+    model: MiniModel, request_: PaintRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    painter = DiffusersPainter.from_mini(model)
+    encoded = list[float]()
+    encode = model.vae.encode
+    monkeypatch.setattr(model.vae, "encode", lambda pixels: encoded.append(float(pixels.mean())) or encode(pixels))
+    short = replace(request_, steps=1, seeds=(1,))
+    first = painter.paint(short, SilentObserver()).balls
+    others = [replace(short, canvas=short.canvas * share) for share in (0.5, 0.25)]
+    for other in others:
+        painter.paint(other, SilentObserver())
+        assert torch.equal(painter.paint(replace(short, canvas=short.canvas.clone()), SilentObserver()).balls, first)
+    assert len(encoded) == 3
+    painter.paint(others[0], SilentObserver())
+    assert len(encoded) == 4

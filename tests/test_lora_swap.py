@@ -104,8 +104,8 @@ def test_turbo_acts_alone_before_the_swap_and_the_exposure_lora_alone_after(
         torch.testing.assert_close(seen[i][1], turbo[i][1], rtol=0, atol=1e-5)
     assert (seen[swap][2] - turbo[swap][2]).abs().max() > 1e-3
     exposure = alone(model, loras, EXPOSURE, 0.75, sampler)
-    denoise = exposure._denoiser(request_, 1)
-    with torch.no_grad():
+    with torch.no_grad(), exposure._hint(request_.depth) as hint:
+        denoise = exposure._denoiser(request_, hint, 1)
         for timestep, latents, prediction in seen[swap:]:
             unwanted, wanted = prediction.chunk(2)
             guided = unwanted + model.defaults.guidance * (wanted - unwanted)

@@ -8,6 +8,7 @@ listing takes the noise just predicted (`impute="predicted"`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -30,6 +31,7 @@ from ..exposure_prompts import embedding_at
 from ..lora import EXPOSURE_SCALE, LoraSwap
 from ..painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
 from ..shapes import BallImage, Image
+from .depth_hint import seen_once
 from .diffusers_lora import EXPOSURE, TURBO, add_lora
 from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults, read_weights
 from .sdxl_files import load_base, load_controlnet
@@ -112,6 +114,7 @@ class DiffusersPainter:
         self.lora_swap = lora_swap
         self._acting: tuple[str, float] | None = None
         self._embeddings: dict[str, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
+        self._encoded: list[tuple[Image, Any]] = []
 
     @staticmethod
     def from_mini(model: MiniModel, **options: Any) -> DiffusersPainter:
@@ -184,10 +187,11 @@ class DiffusersPainter:
             observer.evaluated(evaluations)
 
         def paint(seeds: tuple[int, ...]) -> BallImage:
-            return self._decode_ball(self._inpaint(request, encoded, seeds, counted), request.ball)
+            return self._decode_ball(self._inpaint(request, encoded, hint, seeds, counted), request.ball)
 
         try:
-            balls = torch.cat([balls for _, balls in self._batches.paint(request.seeds, paint, notes.append)])
+            with self._hint(request.depth) as hint:
+                balls = torch.cat([balls for _, balls in self._batches.paint(request.seeds, paint, notes.append)])
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
@@ -198,11 +202,11 @@ class DiffusersPainter:
         return PaintResult(balls, sum(spent), tuple(notes))
 
     def _inpaint(
-        self, request: PaintRequest, encoded: Any, seeds: tuple[int, ...], counted: Callable[[int], None]
+        self, request: PaintRequest, encoded: Any, hint: Tensor, seeds: tuple[int, ...], counted: Callable[[int], None]
     ) -> Tensor:
         """Algorithm 0 for a batch of balls; returns latents (n, 4, h, w).
 
-        `counted` hears of the denoiser evaluations of each step.
+        `hint` is what the ControlNet takes; `counted` hears of the denoiser evaluations of each step.
         """
         scheduler = SAMPLERS[self.sampler](self.pipeline.scheduler.config)
         scheduler.set_timesteps(request.steps, device=self._device)
@@ -219,7 +223,7 @@ class DiffusersPainter:
             else scheduler.add_noise(clean, noise, timesteps[:1].expand(len(seeds)))
         )
         per_step = self.evaluations(len(seeds), 1, 1.0)
-        denoise = self._denoiser(request, len(seeds))
+        denoise = self._denoiser(request, hint, len(seeds))
         for i, timestep in enumerate(timesteps):
             self._choose_lora(float(timestep))
             predicted = denoise(scheduler.scale_model_input(latents, timestep), timestep)
@@ -233,10 +237,23 @@ class DiffusersPainter:
             counted(per_step)
         return latents
 
+    def _hint(self, depth: Image) -> AbstractContextManager[Tensor]:
+        network = self.pipeline.unet if self.pipeline.controlnet is None else self.pipeline.controlnet
+        return seen_once(self.pipeline.controlnet, depth.permute(0, 3, 1, 2).to(self._device, network.dtype))
+
     def _encode(self, canvas: Image) -> Any:
-        """What the autoencoder makes of the canvas: latents, or a distribution to sample them from."""
+        """What the autoencoder makes of the canvas: latents, or a distribution to sample them from.
+
+        The photograph comes back at every exposure, with a composite in between, so the last two are kept.
+        """
+        for known, encoded in self._encoded:
+            if torch.equal(known, canvas):
+                self._encoded = [*((k, e) for k, e in self._encoded if k is not known), (known, encoded)]
+                return encoded
         vae = self.pipeline.vae
-        return vae.encode((canvas.permute(0, 3, 1, 2) * 2 - 1).to(self._device, vae.dtype))
+        encoded = vae.encode((canvas.permute(0, 3, 1, 2) * 2 - 1).to(self._device, vae.dtype))
+        self._encoded = [*self._encoded[-1:], (canvas.clone(), encoded)]
+        return encoded
 
     def _start(self, encoded: Any, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor]:
         """Clean latents of the canvas and initial noise of each ball, (n, 4, h, w) each, in single precision.
@@ -252,7 +269,7 @@ class DiffusersPainter:
             noise.append(torch.randn(sample.shape, generator=generator).to(clean[-1]))
         return torch.cat(clean), torch.cat(noise)
 
-    def _denoiser(self, request: PaintRequest, count: int) -> Callable[[Tensor, Tensor], Tensor]:
+    def _denoiser(self, request: PaintRequest, hint: Tensor, count: int) -> Callable[[Tensor, Tensor], Tensor]:
         """The guided denoiser ε(z, t, C) of Algorithm 0 with text and depth bound."""
         guidance = self.guidance_at(request.ev)
         scale = self.defaults.guidance
@@ -264,7 +281,7 @@ class DiffusersPainter:
         side = float(request.ball.canvas)
         ids = pooled.new_tensor([[side, side, 0, 0, side, side]]).expand(len(pooled), -1)
         added = {"text_embeds": pooled, "time_ids": ids}
-        depth = request.depth.permute(0, 3, 1, 2).to(tokens).expand(len(tokens), -1, -1, -1)
+        cond = hint.expand(len(tokens), -1, -1, -1)
         unet, controlnet = self.pipeline.unet, self.pipeline.controlnet
 
         def denoise(noisy: Tensor, timestep: Tensor) -> Tensor:
@@ -276,7 +293,7 @@ class DiffusersPainter:
                     doubled,
                     timestep,
                     encoder_hidden_states=tokens,
-                    controlnet_cond=depth,
+                    controlnet_cond=cond,
                     conditioning_scale=self.defaults.control_scale,
                     added_cond_kwargs=added,
                     return_dict=False,

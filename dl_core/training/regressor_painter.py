@@ -42,7 +42,7 @@ class RegressorPainter(DiffusersPainter):
         return balls
 
     def _inpaint(
-        self, request: PaintRequest, encoded: Any, seeds: tuple[int, ...], counted: Callable[[int], None]
+        self, request: PaintRequest, encoded: Any, hint: Tensor, seeds: tuple[int, ...], counted: Callable[[int], None]
     ) -> Tensor:
         clean, _ = self._start(encoded, seeds)
         disc = latent_disc(request.ball, clean.shape[-1], grow=request.ball.dilation)
