@@ -43,6 +43,6 @@ class BracketPainter:
         finally:
             self.seconds[request.ev] += perf_counter() - started
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """Denoiser evaluations that painting so many balls takes, exactly."""
-        return next(iter(self._painters.values())).evaluations(balls, steps, strength)
+        return next(iter(self._painters.values())).evaluations(balls, steps, strength, until)

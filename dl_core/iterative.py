@@ -14,7 +14,7 @@ from torch import Tensor
 from .ball import paint_depth, paste_ball
 from .errors import OptionError
 from .median import pixelwise_median, pixelwise_spread
-from .painter import Observer, Painter, PaintRequest, SilentObserver
+from .painter import Observer, Painter, PaintRequest, SilentObserver, check_schedule
 from .shapes import BallImage, Image
 
 __all__ = ["IterativeResult", "Rounds", "iterative_inpaint", "rounds_evaluations"]
@@ -31,6 +31,8 @@ class Rounds:
         steps: denoising steps of a full schedule.
         final: whether one more ball is painted from the last median (the paper does); without it the last median is
             the answer, at no more cost, but softer.
+        until: share of the schedule after which the balls of a median stop (`painter.PaintRequest`); the last ball runs
+            to the end. Without one the answer is a median of clean images predicted that early, softer still.
     """
 
     balls: int = 30
@@ -38,6 +40,7 @@ class Rounds:
     strength: float = 0.8
     steps: int = 30
     final: bool = True
+    until: float = 1.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.balls <= 1000:
@@ -48,6 +51,8 @@ class Rounds:
             raise OptionError("strength", self.strength, "above 0, up to 1")
         if not 1 <= self.steps <= 1000:
             raise OptionError("steps", self.steps, "1 to 1000")
+        if self.until != 1:
+            check_schedule(self.steps, self.strength if self.rounds > 1 else 1.0, self.until)
 
 
 @dataclass(frozen=True)
@@ -100,8 +105,8 @@ def iterative_inpaint(
     seeds = tuple(seed + j for j in range(rounds.balls))
     scene, spent, notes = request, list[int](), list[str]()
 
-    def inpaint_balls(wanted: tuple[int, ...], strength: float) -> BallImage:
-        asked = replace(scene, seeds=wanted, strength=strength, steps=rounds.steps)
+    def inpaint_balls(wanted: tuple[int, ...], strength: float, until: float = 1.0) -> BallImage:
+        asked = replace(scene, seeds=wanted, strength=strength, steps=rounds.steps, until=until)
         result = painter.paint(asked, observer)
         spent.append(result.evaluations)
         notes.extend(result.notes)
@@ -116,7 +121,7 @@ def iterative_inpaint(
         return found(ball, ball, ball)
 
     for i in range(rounds.rounds):
-        balls = inpaint_balls(seeds, rounds.strength if i > 0 else 1.0)
+        balls = inpaint_balls(seeds, rounds.strength if i > 0 else 1.0, rounds.until)
         median = pixelwise_median(balls)
         observer.painted(request.ev, i, balls)
         scene = _with_median(request, median, depth_of)
@@ -135,7 +140,7 @@ def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:
     """Denoiser evaluations that `iterative_inpaint` will spend at one exposure, exactly."""
     if rounds.rounds == 0:
         return painter.evaluations(1, rounds.steps, 1.0)
-    first = painter.evaluations(rounds.balls, rounds.steps, 1.0)
-    again = painter.evaluations(rounds.balls, rounds.steps, rounds.strength) * (rounds.rounds - 1)
+    first = painter.evaluations(rounds.balls, rounds.steps, 1.0, rounds.until)
+    again = painter.evaluations(rounds.balls, rounds.steps, rounds.strength, rounds.until) * (rounds.rounds - 1)
     last = painter.evaluations(1, rounds.steps, rounds.strength) if rounds.final else 0
     return first + again + last

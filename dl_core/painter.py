@@ -6,6 +6,7 @@ node pack's ComfyPainter, and the tests' AnalyticPainter, which draws true balls
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
@@ -21,7 +22,9 @@ __all__ = [
     "PaintResult",
     "Painter",
     "SilentObserver",
+    "check_schedule",
     "first_step",
+    "steps_run",
 ]
 
 Imputing = Literal["initial", "predicted"]
@@ -42,7 +45,9 @@ class PaintRequest:
         ev: exposure value of the ball, 0 or below.
         seeds: one per ball wanted. The same seed starts from the same noise at every EV and strength.
         strength: 1 paints from pure noise; below 1 is SDEdit from the canvas.
-        steps: length of the full schedule; `strength` decides how much of it is run.
+        steps: length of the full schedule; `strength` and `until` decide how much of it is run.
+        until: share of the schedule after which denoising stops, counted over all `steps` whatever the strength. The
+            answer is then the clean image that the last evaluation predicted. 1 runs to the end.
     """
 
     canvas: Image
@@ -52,16 +57,12 @@ class PaintRequest:
     seeds: tuple[int, ...]
     strength: float = 1.0
     steps: int = 30
+    until: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.seeds:
             raise OptionError("balls", 0, "1 or more")
-        if not 0 < self.strength <= 1:
-            raise OptionError("strength", self.strength, "above 0, up to 1")
-        if self.steps < 1:
-            raise OptionError("steps", self.steps, "1 or more")
-        if first_step(self.steps, self.strength) >= self.steps:
-            raise OptionError("strength", self.strength, f"at least {1 / self.steps:.3g} with {self.steps} steps")
+        check_schedule(self.steps, self.strength, self.until)
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class Painter(Protocol):
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
         """Paint the balls of a request, telling the observer of each denoising step."""
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """Denoiser evaluations that painting so many balls will take, exactly."""
 
 
@@ -117,3 +118,32 @@ def first_step(steps: int, strength: float) -> int:
     Strength 0.8 of 30 steps starts at step 6 and runs 24.
     """
     return steps - min(int(steps * strength), steps)
+
+
+def steps_run(steps: int, strength: float, until: float = 1.0) -> range:
+    """Indices of the steps that are run, of a schedule of `steps`; empty where `until` comes before the first.
+
+    Strength 0.8 of 30 steps until 0.5 runs steps 6 to 14.
+    """
+    return range(first_step(steps, strength), min(int(steps * until), steps))
+
+
+def check_schedule(steps: int, strength: float, until: float = 1.0) -> None:
+    """Raise OptionError for a schedule that is out of range or runs no step; the option at fault is named."""
+    if not 0 < strength <= 1:
+        raise OptionError("strength", strength, "above 0, up to 1")
+    if not 0 < until <= 1:
+        raise OptionError("until", until, "above 0, up to 1")
+    if steps < 1:
+        raise OptionError("steps", steps, "1 or more")
+    first = first_step(steps, strength)
+    if first >= steps:
+        raise OptionError("strength", strength, f"at least {_share(1, steps)} with {steps} steps")
+    if not steps_run(steps, strength, until):
+        accepted = f"at least {_share(first + 1, steps)} with {steps} steps at strength {strength:g}"
+        raise OptionError("until", until, accepted)
+
+
+def _share(part: int, steps: int) -> str:
+    """The smallest share of three digits that holds so many steps."""
+    return f"{math.ceil(1000 * part / steps) / 1000:g}"

@@ -21,12 +21,13 @@ from typing import Any, Final
 import comfy.model_management
 import torch
 
-from ..dl_core.ball import Ball, crop_ball, disc_mask
+from ..dl_core.ball import disc_mask
 from ..dl_core.batches import Batches
+from ..dl_core.decoding import decode_ball, decode_margin
 from ..dl_core.errors import OptionError
 from ..dl_core.finished import FinishedBalls, content_key
-from ..dl_core.painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
-from ..dl_core.shapes import BallImage, Image, Mask
+from ..dl_core.painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, steps_run
+from ..dl_core.shapes import BallImage, Mask
 from .architecture import require_conditioning, require_control_net, require_sdxl, require_vae
 from .sampling import LEADING, SAMPLERS, SCHEDULERS, STOCHASTIC, BallNoise, sample, sigmas_of
 
@@ -34,11 +35,6 @@ __all__ = ["ComfyPainter", "Guidance", "Networks"]
 
 MOST_AT_ONCE: Final = 16
 """Balls of a batch that is chosen from free memory: beyond it a batch gains little, and an interrupt loses more."""
-
-PLAIN_MARGIN: Final = 4
-"""Latent cells decoded around the ball: 4 change it by 0.002 of an 8-bit code with the mini model's autoencoder."""
-NORMALIZING_MARGIN: Final = 16
-"""The same for decoders with group normalization, whose statistics are those of all they see."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +123,9 @@ class ComfyPainter:
         self._finished = FinishedBalls(0) if finished is None else finished
         self._batches: Batches | None = None
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """Denoiser evaluations that painting so many balls takes, exactly."""
-        return balls * (steps - first_step(steps, strength)) * (1 if self._guidance.cfg == 1 else 2)
+        return balls * len(steps_run(steps, strength, until)) * (1 if self._guidance.cfg == 1 else 2)
 
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
         """Paint the balls of a request.
@@ -144,7 +140,8 @@ class ComfyPainter:
         mask = self._mask if self._mask is not None else disc_mask(request.ball, grow=request.ball.dilation)
         sampler, scheduler = self._guidance.sampler, self._guidance.scheduler
         every = sigmas_of(self._networks.model, sampler, scheduler, request.steps)
-        sigmas = every[first_step(request.steps, request.strength) :]
+        run = steps_run(request.steps, request.strength, request.until)
+        sigmas, evaluated = every[run.start :], len(run)
         if len(sigmas) < 3 and sampler.startswith("uni_pc"):
             raise OptionError("steps", request.steps, f"at least 2 steps to run with the sampler {sampler}")
         if sampler in STOCHASTIC and request.strength == 1:  # once an exposure
@@ -156,9 +153,9 @@ class ComfyPainter:
         balls = self._finished.find(key, request.seeds)
         if balls:
             notes.append(f"{len(balls)} of {len(request.seeds)} balls taken from an earlier run")
-            observer.evaluated(self.evaluations(len(balls), request.steps, request.strength))
+            observer.evaluated(self.evaluations(len(balls), request.steps, request.strength, request.until))
         wanted = tuple(seed for seed in request.seeds if seed not in balls)
-        for seeds, painted in self._paint(request, wanted, mask, sigmas, counter, notes.append):
+        for seeds, painted in self._paint(request, wanted, mask, sigmas, evaluated, counter, notes.append):
             self._finished.keep(key, seeds, painted)
             balls |= dict(zip(seeds, painted.split(1), strict=True))
             if self._on_balls:
@@ -171,6 +168,7 @@ class ComfyPainter:
         wanted: tuple[int, ...],
         mask: Mask,
         sigmas: torch.Tensor,
+        evaluations: int,
         counter: _Counter,
         note: Callable[[str], None],
     ) -> Iterator[tuple[tuple[int, ...], BallImage]]:
@@ -178,11 +176,12 @@ class ComfyPainter:
         if not wanted:
             return
         model = _watched(self._networks.model, counter)
-        latent = self._networks.vae.encode(request.canvas)
+        vae = self._networks.vae
+        latent, margin = vae.encode(request.canvas), decode_margin(vae.first_stage_model)
         positive, negative = self._controlled(request)
 
         guidance = self._guidance
-        after_posterior = _draws_posterior(self._networks.vae)
+        after_posterior = _draws_posterior(vae)
 
         def paint(seeds: tuple[int, ...]) -> BallImage:
             samples = sample(
@@ -197,8 +196,9 @@ class ComfyPainter:
                 negative=negative,
                 impute=guidance.impute,
                 from_noise=request.strength == 1,
+                evaluations=evaluations,
             )
-            return _decode_ball(self._networks.vae, samples, request.ball)
+            return decode_ball(vae.decode, samples, request.ball, margin)
 
         if self._batches is None:
             size = self._guidance.batch_size or self._room(latent)
@@ -288,24 +288,3 @@ def _watched(model: Any, counter: _Counter) -> Any:
 def _draws_posterior(vae: Any) -> bool:
     """Whether a VAE encodes to a distribution, as SDXL's does, and not to latents, as TAESD does."""
     return hasattr(vae.first_stage_model, "regularization")
-
-
-def _decode_ball(vae: Any, samples: torch.Tensor, ball: Ball) -> BallImage:
-    """Decode the ball's neighbourhood and cut the ball out: (N, C, h, w) latents -> (N, D, D, 3) in [0, 1]."""
-    cells = samples.shape[-1]
-    cell = ball.canvas // cells
-    margin = _decode_margin(vae)
-
-    def neighbourhood(start: int) -> slice:
-        end = -(-(start + ball.diameter) // cell)
-        return slice(max(0, start // cell - margin), min(cells, end + margin))
-
-    rows, columns = neighbourhood(ball.top), neighbourhood(ball.left)
-    pixels: Image = vae.decode(samples[:, :, rows, columns])
-    window = Ball(ball.left - columns.start * cell, ball.top - rows.start * cell, ball.diameter, 0, 0)
-    return crop_ball(pixels, window).clamp(0, 1)
-
-
-def _decode_margin(vae: Any) -> int:
-    layers = vae.first_stage_model.modules()
-    return NORMALIZING_MARGIN if any(isinstance(layer, torch.nn.GroupNorm) for layer in layers) else PLAIN_MARGIN

@@ -123,6 +123,7 @@ def sample(
     negative: Any,
     impute: Imputing,
     from_noise: bool,
+    evaluations: int,
 ) -> torch.Tensor:
     """Paint a batch of balls in latent space.
 
@@ -140,6 +141,8 @@ def sample(
         from_noise: whether the first evaluation sees noise alone. ComfyUI puts the photograph in around the mask from
             the first evaluation on; the authors' code and Algorithm 0 start from noise everywhere and put it in after
             the first step.
+        evaluations: of the model for each ball, at most the steps of `sigmas`. After fewer the answer is what the last
+            one took for the clean latents, the photograph's around the mask; so it is that of a whole run's step.
 
     Returns:
         (n, C, h, w) latents.
@@ -153,7 +156,14 @@ def sample(
         model,
         noise.initial,
         cfg,
-        _sampler(sampler, model, noise, predicted, from_noise=from_noise),
+        _sampler(
+            sampler,
+            model,
+            noise,
+            predicted,
+            from_noise=from_noise,
+            evaluations=evaluations if evaluations < len(sigmas) - 1 else None,
+        ),
         sigmas.clone(),  # uni_pc writes into it
         positive,
         negative,
@@ -164,19 +174,36 @@ def sample(
     )
 
 
-def _sampler(name: str, model: Any, noise: BallNoise, predicted: _PredictedNoise | None, *, from_noise: bool) -> Any:
-    """ComfyUI's sampler of a name, with the balls' own noise and what is asked for around the mask."""
+def _sampler(
+    name: str,
+    model: Any,
+    noise: BallNoise,
+    predicted: _PredictedNoise | None,
+    *,
+    from_noise: bool,
+    evaluations: int | None,
+) -> Any:
+    """ComfyUI's sampler of a name, with the balls' own noise and what is asked for around the mask.
+
+    It stops after so many evaluations, where a number is given.
+    """
     sampler = comfy.samplers.sampler_object(name)
     extra = {**sampler.extra_options, **({"noise_sampler": noise} if name in STOCHASTIC else {})}
     sampling = model.get_model_object("model_sampling")
 
     def run(inpaint: Any, x: torch.Tensor, sigmas: torch.Tensor, **options: Any) -> torch.Tensor:
+        start = None
         if from_noise:
             x = sampling.noise_scaling(sigmas[0], inpaint.noise, torch.zeros_like(x), True)
-        start = x / sigmas[0] if from_noise else None
-        return sampler.sampler_function(  # type: ignore[no-any-return]
-            _AroundTheMask(inpaint, start, predicted), x, sigmas, **options
-        )
+            # Where the first estimate is the answer, the photograph belongs around it, and the noise makes up for it.
+            around = inpaint.latent_image if evaluations == 1 else torch.zeros_like(x)
+            start = (around, (x - around) / sigmas[0])
+        try:
+            return sampler.sampler_function(  # type: ignore[no-any-return]
+                _AroundTheMask(inpaint, start, predicted, evaluations), x, sigmas, **options
+            )
+        except _EarlyAnswer as early:
+            return early.latents
 
     return comfy.samplers.KSAMPLER(run, extra, sampler.inpaint_options)
 
@@ -194,30 +221,52 @@ class _PredictedNoise:
         return denoised  # type: ignore[no-any-return]
 
 
+class _EarlyAnswer(Exception):  # noqa: N818 -- no error: the way out of a sampler before its schedule ends
+    """Clean latents as the last evaluation asked for took them to be."""
+
+    def __init__(self, latents: torch.Tensor) -> None:
+        super().__init__("denoising ends here")
+        self.latents = latents
+
+
 class _AroundTheMask:
     """ComfyUI's inpainting denoiser, told evaluation by evaluation what to put around the mask.
 
     Args:
         inpaint: ComfyUI's; what lies around the mask is its `latent_image` under its `noise`.
-        start: put there at the first evaluation in place of the photograph, in units of the first noise level.
+        start: latents and noise put there at the first evaluation in place of the photograph's, the noise in units of
+            the first noise level.
         predicted: where the noise of later evaluations is found; the initial noise throughout without it.
+        evaluations: after which `_EarlyAnswer` ends the sampling; none for a sampler that runs to its end.
     """
 
-    def __init__(self, inpaint: Any, start: torch.Tensor | None, predicted: _PredictedNoise | None) -> None:
+    def __init__(
+        self,
+        inpaint: Any,
+        start: tuple[torch.Tensor, torch.Tensor] | None,
+        predicted: _PredictedNoise | None,
+        evaluations: int | None,
+    ) -> None:
         self._inpaint, self._start, self._predicted = inpaint, start, predicted
         self._known = (inpaint.latent_image, inpaint.noise)
+        self._left = evaluations
 
     def __call__(self, *arguments: Any, **options: Any) -> torch.Tensor:
         inpaint, (latent, initial) = self._inpaint, self._known
         if self._start is not None:
-            inpaint.latent_image, inpaint.noise = torch.zeros_like(latent), self._start
+            inpaint.latent_image, inpaint.noise = self._start
             self._start = None
         elif self._predicted is not None and self._predicted.noise is not None:
             inpaint.noise = self._predicted.noise
         try:
-            return inpaint(*arguments, **options)  # type: ignore[no-any-return]
+            clean = inpaint(*arguments, **options)
         finally:
             inpaint.latent_image, inpaint.noise = latent, initial
+        if self._left is not None:
+            self._left -= 1
+            if self._left == 0:
+                raise _EarlyAnswer(clean)
+        return clean  # type: ignore[no-any-return]
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._inpaint, name)

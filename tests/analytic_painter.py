@@ -11,7 +11,7 @@ from torch import Tensor
 from dl_core.ball import crop_ball
 from dl_core.exposure import expose
 from dl_core.geometry import camera_rotation, latlong_to_ball, rotate_latlong
-from dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+from dl_core.painter import Observer, PaintRequest, PaintResult, steps_run
 
 GUIDED = 2
 """Denoiser evaluations a step: with and without the prompt."""
@@ -58,18 +58,19 @@ class AnalyticPainter:
     def __post_init__(self) -> None:
         self._true_ball = lru_cache(self._render)
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
-        return GUIDED * balls * (steps - first_step(steps, strength))
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
+        return GUIDED * balls * len(steps_run(steps, strength, until))
 
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
         self.requests.append(request)
-        for _ in range(first_step(request.steps, request.strength), request.steps):
+        for _ in steps_run(request.steps, request.strength, request.until):
             self.spent += GUIDED * len(request.seeds)
             observer.evaluated(GUIDED * len(request.seeds))
         drawn = torch.cat([self._draw(request, seed) for seed in request.seeds])
         if request.strength < 1:
             drawn = torch.lerp(drawn, self._mended(request), self.flaws.pull)
-        return PaintResult(drawn, self.evaluations(len(request.seeds), request.steps, request.strength))
+        cost = self.evaluations(len(request.seeds), request.steps, request.strength, request.until)
+        return PaintResult(drawn, cost)
 
     def _mended(self, request: PaintRequest) -> Tensor:
         """The canvas' ball on its way to the true one."""

@@ -24,12 +24,13 @@ from diffusers import (
 from jaxtyping import Float
 from torch import Tensor
 
-from ..ball import Ball, crop_ball, disc_mask, require_canvas
+from ..ball import Ball, disc_mask, require_canvas
 from ..batches import Batches, is_out_of_memory
+from ..decoding import decode_ball, decode_margin
 from ..errors import ModelError, OptionError
 from ..exposure_prompts import embedding_at
 from ..lora import EXPOSURE_SCALE, LoraSwap
-from ..painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, first_step
+from ..painter import IMPUTINGS, Imputing, Observer, PaintRequest, PaintResult, steps_run
 from ..shapes import BallImage, Image
 from .depth_hint import seen_once
 from .diffusers_lora import EXPOSURE, TURBO, add_lora
@@ -166,9 +167,9 @@ class DiffusersPainter:
             options = {"lora_swap": LoraSwap(), **options}
         return DiffusersPainter(pipeline.to(device), PAPER_DEFAULTS, **options)
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """See `painter.Painter`: two a ball and step, one where guidance is 1 and the negative prompt has no say."""
-        return balls * (steps - first_step(steps, strength)) * (1 if self.defaults.guidance == 1 else 2)
+        return balls * len(steps_run(steps, strength, until)) * (1 if self.defaults.guidance == 1 else 2)
 
     @torch.no_grad()
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
@@ -204,16 +205,16 @@ class DiffusersPainter:
     def _inpaint(
         self, request: PaintRequest, encoded: Any, hint: Tensor, seeds: tuple[int, ...], counted: Callable[[int], None]
     ) -> Tensor:
-        """Algorithm 0 for a batch of balls; returns latents (n, 4, h, w).
+        """Algorithm 0 for a batch of balls, up to the request's `until`; returns latents (n, 4, h, w).
 
         `hint` is what the ControlNet takes; `counted` hears of the denoiser evaluations of each step.
         """
         scheduler = SAMPLERS[self.sampler](self.pipeline.scheduler.config)
         scheduler.set_timesteps(request.steps, device=self._device)
-        begin = first_step(request.steps, request.strength)
-        timesteps = scheduler.timesteps[begin * scheduler.order :]
+        run = steps_run(request.steps, request.strength, request.until)
+        timesteps = scheduler.timesteps[run.start :]
         if hasattr(scheduler, "set_begin_index"):  # those that count steps; DDIM reads the timestep it is given
-            scheduler.set_begin_index(begin * scheduler.order)
+            scheduler.set_begin_index(run.start)
 
         clean, noise = self._start(encoded, seeds)
         mask = ball_latent_mask(request.ball).to(clean)
@@ -224,17 +225,23 @@ class DiffusersPainter:
         )
         per_step = self.evaluations(len(seeds), 1, 1.0)
         denoise = self._denoiser(request, hint, len(seeds))
-        for i, timestep in enumerate(timesteps):
+        for i, timestep in enumerate(timesteps[: len(run)]):
             self._choose_lora(float(timestep))
-            predicted = denoise(scheduler.scale_model_input(latents, timestep), timestep)
-            known_noise = (
-                noise if self.impute == "initial" else _predicted_noise(scheduler, predicted, latents, timestep)
-            )
-            latents = scheduler.step(predicted, timestep, latents, return_dict=False)[0]
-            last = i + 1 == len(timesteps)
-            known = clean if last else scheduler.add_noise(clean, known_noise, timesteps[i + 1].expand(len(seeds)))
-            latents = (1 - mask) * known + mask * latents
+            seen = scheduler.scale_model_input(latents, timestep)
+            predicted = denoise(seen, timestep)
             counted(per_step)
+            if i + 1 == len(run) < len(timesteps):
+                latents = _predicted_clean(scheduler, predicted, seen, timestep)
+            else:
+                latents = scheduler.step(predicted, timestep, latents, return_dict=False)[0]
+            if i + 1 == len(run):
+                known = clean
+            else:
+                known_noise = (
+                    noise if self.impute == "initial" else _predicted_noise(scheduler, predicted, seen, timestep)
+                )
+                known = scheduler.add_noise(clean, known_noise, timesteps[i + 1].expand(len(seeds)))
+            latents = (1 - mask) * known + mask * latents
         return latents
 
     def _hint(self, depth: Image) -> AbstractContextManager[Tensor]:
@@ -346,9 +353,12 @@ class DiffusersPainter:
 
     def _decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
         vae = self.pipeline.vae
-        pixels = vae.decode(latents.to(vae.dtype) / vae.config.scaling_factor).sample
-        canvas = (pixels.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
-        return crop_ball(canvas, ball).cpu().contiguous()
+
+        def decode(part: Tensor) -> Image:
+            pixels = vae.decode(part.to(vae.dtype) / vae.config.scaling_factor).sample
+            return (pixels.float() / 2 + 0.5).permute(0, 2, 3, 1)
+
+        return decode_ball(decode, latents, ball, decode_margin(vae)).cpu().contiguous()
 
     @property
     def _device(self) -> torch.device:
@@ -360,9 +370,20 @@ def _empty_cache() -> None:
         torch.cuda.empty_cache()
 
 
-def _predicted_noise(scheduler: Any, predicted: Tensor, latents: Tensor, timestep: Tensor) -> Tensor:
-    """The noise a prediction stands for, whether the model predicts noise or velocity."""
+def _predicted_noise(scheduler: Any, predicted: Tensor, seen: Tensor, timestep: Tensor) -> Tensor:
+    """The noise a prediction stands for, whether the model predicts noise or velocity.
+
+    `seen` is what the denoiser saw: latents of signal and noise whose squares add up to 1.
+    """
     if scheduler.config.prediction_type == "epsilon":
         return predicted
-    kept = scheduler.alphas_cumprod[int(timestep)].to(latents)
-    return kept.sqrt() * predicted + (1 - kept).sqrt() * latents
+    kept = scheduler.alphas_cumprod[int(timestep)].to(seen)
+    return kept.sqrt() * predicted + (1 - kept).sqrt() * seen
+
+
+def _predicted_clean(scheduler: Any, predicted: Tensor, seen: Tensor, timestep: Tensor) -> Tensor:
+    """The clean latents a prediction stands for; arguments as of `_predicted_noise`."""
+    kept = scheduler.alphas_cumprod[int(timestep)].to(seen)
+    if scheduler.config.prediction_type == "epsilon":
+        return (seen - (1 - kept).sqrt() * predicted) / kept.sqrt()
+    return kept.sqrt() * seen - (1 - kept).sqrt() * predicted

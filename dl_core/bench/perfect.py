@@ -9,7 +9,7 @@ from typing import Final
 from ..ball import crop_ball, paste_ball
 from ..exposure import expose, quantize
 from ..geometry import latlong_to_ball
-from ..painter import Observer, PaintRequest, PaintResult, SilentObserver, first_step
+from ..painter import Observer, PaintRequest, PaintResult, SilentObserver, steps_run
 from ..shapes import BallImage, Image, Latlong
 
 __all__ = ["PerfectPainter", "RoundTripPainter"]
@@ -29,9 +29,9 @@ class PerfectPainter:
     latlong_hdr: Latlong
     _balls: dict[int, BallImage] = field(default_factory=dict)
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """See `painter.Painter`."""
-        return _GUIDED * balls * (steps - first_step(steps, strength))
+        return _GUIDED * balls * len(steps_run(steps, strength, until))
 
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
         """See `painter.Painter`."""
@@ -39,7 +39,7 @@ class PerfectPainter:
         if diameter not in self._balls:
             self._balls[diameter] = latlong_to_ball(self.latlong_hdr, diameter)
         painted = quantize(expose(self._balls[diameter], request.ev))
-        spent = self.evaluations(len(request.seeds), request.steps, request.strength)
+        spent = self.evaluations(len(request.seeds), request.steps, request.strength, request.until)
         observer.evaluated(spent)
         return PaintResult(painted.expand(len(request.seeds), -1, -1, -1), spent)
 
@@ -56,7 +56,7 @@ class RoundTripPainter:
     truth: PerfectPainter
     code: Callable[[Image], Image]
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """None: no denoiser is asked."""
         return 0
 
