@@ -145,5 +145,8 @@ def check_schedule(steps: int, strength: float, until: float = 1.0) -> None:
 
 
 def _share(part: int, steps: int) -> str:
-    """The smallest share of three digits that holds so many steps."""
-    return f"{math.ceil(1000 * part / steps) / 1000:g}"
+    """The smallest share of three digits that holds so many steps, in floating point too."""
+    thousandths = math.ceil(1000 * part / steps)
+    if int(steps * (thousandths / 1000)) < part:
+        thousandths += 1
+    return f"{thousandths / 1000:g}"

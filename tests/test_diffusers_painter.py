@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from dl_core.backends.mini import MiniModel, read_weights
 from dl_core.ball import Ball, crop_ball, paint_depth, place_ball
 from dl_core.errors import ImageError, Interrupted, ModelError, OptionError
 from dl_core.iterative import Rounds, rounds_evaluations
-from dl_core.painter import Imputing, PaintRequest, SilentObserver
+from dl_core.painter import IMPUTINGS, Imputing, PaintRequest, SilentObserver, steps_run
 from dl_core.training.autoencoder import write_closed_form_encoder, write_thumbnail_decoder
 
 SIDE = 128
@@ -85,6 +86,72 @@ def test_balls_equal_those_of_the_pipeline(
     assert painted.std() > 0.02
 
 
+def _clean_estimates(build: Callable[[Any], Any], found: list[Tensor]) -> Callable[[Any], Any]:
+    """A row of `SAMPLERS` whose scheduler keeps the clean latents that it takes every prediction for, by itself."""
+
+    def recording(config: Any) -> Any:
+        scheduler = build(config)
+        if hasattr(scheduler, "convert_model_output"):
+            convert = scheduler.convert_model_output
+            scheduler.convert_model_output = lambda *given, **options: _kept(convert(*given, **options), found)
+        else:
+            step = scheduler.step
+
+            def keep(*given: Any, return_dict: bool, **options: Any) -> tuple[Tensor]:
+                output = step(*given, **options)
+                found.append(output.pred_original_sample)
+                return (output.prev_sample,)
+
+            scheduler.step = keep
+        return scheduler
+
+    return recording
+
+
+def _kept(estimate: Tensor, found: list[Tensor]) -> Tensor:
+    found.append(estimate.clone())
+    return estimate
+
+
+SAMPLED = [
+    (sampler, impute) for sampler in SAMPLERS for impute in IMPUTINGS if (sampler, impute) != ("euler", "predicted")
+]
+
+
+@pytest.mark.parametrize(("sampler", "impute"), SAMPLED)
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+@pytest.mark.parametrize(("strength", "until", "last"), [(1.0, 0.75, 2), (0.5, 0.75, 0)])
+def test_an_early_answer_is_the_schedulers_own_clean_estimate(
+    model: MiniModel,
+    request_: PaintRequest,
+    monkeypatch: pytest.MonkeyPatch,
+    sampler: str,
+    impute: Imputing,
+    prediction: str,
+    strength: float,
+    until: float,
+    last: int,
+) -> None:
+    """At that step of a run to the end, with the photograph around the disc, decoded as a whole canvas."""
+    painter = DiffusersPainter.from_mini(model, batch=2, sampler=sampler, impute=impute)
+    settings = {**painter.pipeline.scheduler.config, "prediction_type": prediction}
+    painter.pipeline.scheduler = type(painter.pipeline.scheduler).from_config(settings)
+    asked = replace(request_, strength=strength)
+    early = painter.paint(replace(asked, until=until), SilentObserver()).balls
+
+    estimates: list[Tensor] = []
+    monkeypatch.setitem(SAMPLERS, sampler, _clean_estimates(SAMPLERS[sampler], estimates))
+    painter.paint(asked, SilentObserver())
+    assert len(estimates) == len(steps_run(asked.steps, strength))
+    with torch.no_grad():
+        photograph = model.vae.encode(request_.canvas.permute(0, 3, 1, 2) * 2 - 1).latents
+        expected = torch.lerp(photograph, estimates[last], ball_latent_mask(request_.ball))
+        canvas = (model.vae.decode(expected).sample / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
+    # Half an 8-bit code for the cut of the decoding, and rounding.
+    assert (early - crop_ball(canvas, request_.ball)).abs().max() < 0.5 / 255 + 1e-4
+    assert (estimates[last] - estimates[-1]).abs().max() > 1e-3
+
+
 class _Count(SilentObserver):
     def __init__(self, stop_at: int | None = None) -> None:
         self.total = 0
@@ -107,20 +174,24 @@ class _CountedUNet:
         self.evaluated += len(arguments[0])
 
 
-@pytest.mark.parametrize(("guidance", "strength"), [(1.0, 1.0), (3.0, 1.0), (3.0, 0.5)])
+@pytest.mark.parametrize(
+    ("guidance", "strength", "until", "steps"),
+    [(1.0, 1.0, 1.0, 4), (3.0, 1.0, 1.0, 4), (3.0, 0.5, 1.0, 2), (3.0, 1.0, 0.5, 2), (1.0, 0.5, 0.75, 1)],
+)
 def test_the_cost_told_planned_and_reported_is_what_the_unet_does(
-    model: MiniModel, request_: PaintRequest, guidance: float, strength: float
+    model: MiniModel, request_: PaintRequest, guidance: float, strength: float, until: float, steps: int
 ) -> None:
     painter = DiffusersPainter.from_mini(model, batch=2)
     painter.defaults = replace(painter.defaults, guidance=guidance)
-    asked = replace(request_, strength=strength, seeds=(1, 2, 3))
+    asked = replace(request_, strength=strength, until=until, seeds=(1, 2, 3))
     counted, observer = _CountedUNet(model.unet), _Count()
     try:
         result = painter.paint(asked, observer)
     finally:
         counted.handle.remove()
-    planned = painter.evaluations(3, asked.steps, strength)
+    planned = painter.evaluations(3, asked.steps, strength, until)
     assert counted.evaluated == result.evaluations == observer.total == planned
+    assert planned == 3 * steps * (1 if guidance == 1 else 2)
 
 
 def test_the_paper_costs_9864_evaluations(painter: DiffusersPainter) -> None:

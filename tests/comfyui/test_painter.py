@@ -32,9 +32,11 @@ def painter(graph: Any, **options: Any) -> Any:
     return module.ComfyPainter(module.Networks(**graph.sockets()), module.Guidance(**options), **extra)
 
 
-def request(scene: Any, seeds: tuple[int, ...] = (0,), strength: float = 1.0, steps: int = STEPS) -> Any:
+def request(
+    scene: Any, seeds: tuple[int, ...] = (0,), strength: float = 1.0, steps: int = STEPS, until: float = 1.0
+) -> Any:
     kind = pack_module("dl_core.painter").PaintRequest
-    return kind(scene.canvas, scene.depth, scene.ball, 0.0, seeds, strength=strength, steps=steps)
+    return kind(scene.canvas, scene.depth, scene.ball, 0.0, seeds, strength=strength, steps=steps, until=until)
 
 
 def paint(graph: Any, asked: Any, **options: Any) -> Any:
@@ -55,9 +57,12 @@ def test_list_of_samplers_is_the_one_tested(pack: Any) -> None:
 
 
 @pytest.mark.parametrize("sampler", samplers())
-@pytest.mark.parametrize(("cfg", "strength"), [(5.0, 1.0), (1.0, 0.7)])
+@pytest.mark.parametrize(
+    ("cfg", "strength", "until", "steps"),
+    [(5.0, 1.0, 1.0, 3), (1.0, 0.7, 1.0, 2), (5.0, 1.0, 0.4, 1), (1.0, 0.7, 0.7, 1)],
+)
 def test_evaluations_are_counted_and_foretold(
-    graph: Any, scene: Any, sampler: str, cfg: float, strength: float
+    graph: Any, scene: Any, sampler: str, cfg: float, strength: float, until: float, steps: int
 ) -> None:
     """Counted where the network itself is called, a batch of n being n evaluations."""
     calls: list[int] = []
@@ -67,12 +72,12 @@ def test_evaluations_are_counted_and_foretold(
     observer = Recorder()
     brush = painter(graph, cfg=cfg, sampler=sampler, batch_size=2)
     try:
-        result = brush.paint(request(scene, (3, 4, 5), strength), observer)
+        result = brush.paint(request(scene, (3, 4, 5), strength, until=until), observer)
     finally:
         hook.remove()
-    foretold = brush.evaluations(3, STEPS, strength)
+    foretold = brush.evaluations(3, STEPS, strength, until)
     assert sum(calls) == result.evaluations == observer.evaluations == foretold
-    assert foretold == 3 * {1.0: 3, 0.7: 2}[strength] * (1 if cfg == 1 else 2)
+    assert foretold == 3 * steps * (1 if cfg == 1 else 2)
     assert result.balls.shape == (3, 32, 32, 3)
     assert result.balls.min() >= 0
     assert result.balls.max() <= 1
@@ -201,13 +206,54 @@ def test_one_step_is_refused_where_the_sampler_cannot(graph: Any, scene: Any) ->
     assert paint(graph, request(scene, steps=1), sampler="euler").evaluations == 2
 
 
-def test_decoding_the_neighbourhood_is_decoding_the_ball(graph: Any, generator: torch.Generator) -> None:
-    """The margin covers most of the decoder's field of view: the difference stays under half an 8-bit code."""
-    module, balls = pack_module("nodes.painter"), pack_module("dl_core.ball")
-    ball = balls.place_ball(512, 64, x=200, y=260)
-    latents = torch.randn(1, 4, 64, 64, generator=generator)
-    whole = balls.crop_ball(graph.vae.decode(latents), ball)
-    assert (module._decode_ball(graph.vae, latents, ball) - whole).abs().max() < 0.5 / 255
+def clean_estimates(graph: Any, asked: Any, **options: Any) -> tuple[Any, list[torch.Tensor]]:
+    """A run to the end: its balls, and what ComfyUI's guided model took for the clean latents at each step."""
+    found: list[torch.Tensor] = []
+
+    def keep(evaluated: Any) -> Any:
+        found.append(evaluated["denoised"].clone())
+        return evaluated["denoised"]
+
+    model = graph.model.clone()
+    model.set_model_sampler_post_cfg_function(keep)
+    return paint(replace(graph, model=model), asked, **options).balls, found
+
+
+@pytest.mark.parametrize("sampler", samplers())
+@pytest.mark.parametrize(
+    ("strength", "until", "last", "impute"),
+    [(1.0, 0.25, 0, "initial"), (0.8, 0.6, 1, "predicted")],
+)
+def test_an_early_answer_is_what_a_whole_run_took_for_clean_at_that_step(
+    graph: Any, scene: Any, sampler: str, strength: float, until: float, last: int, impute: str
+) -> None:
+    """With the photograph around the mask, decoded as a whole canvas."""
+    from comfy.sampler_helpers import prepare_mask
+
+    asked = request(scene, (7, 8), strength, steps=5 if strength < 1 else 4)
+    whole, estimates = clean_estimates(graph, asked, sampler=sampler, impute=impute)
+    early = paint(graph, replace(asked, until=until), sampler=sampler, impute=impute).balls
+    mask = prepare_mask(scene.mask, estimates[last].shape, "cpu")
+    latents = torch.lerp(graph.vae.encode(scene.canvas), estimates[last], mask)
+    expected = pack_module("dl_core.ball").crop_ball(graph.vae.decode(latents), scene.ball)
+    # Half an 8-bit code for the cut of the decoding, and rounding.
+    assert (early - expected).abs().max() < 0.5 / 255 + 1e-4
+    assert not torch.equal(early, whole)
+    assert len(estimates) == 4
+
+
+def test_early_answers_and_whole_ones_are_kept_apart(graph: Any, scene: Any) -> None:
+    module = pack_module("nodes.painter")
+    store = pack_module("dl_core.finished").FinishedBalls(10**6)
+    brush = module.ComfyPainter(module.Networks(**graph.sockets()), module.Guidance(), finished=store)
+    costs = {
+        until: [brush.paint(request(scene, steps=4, until=until), Recorder()).evaluations for _ in range(2)]
+        for until in (1.0, 0.5, 0.75)
+    }
+    assert costs == {1.0: [8, 0], 0.5: [4, 0], 0.75: [6, 0]}
+    observer = Recorder()
+    brush.paint(request(scene, steps=4, until=0.5), observer)
+    assert observer.evaluations == 4  # of an earlier run, told at once
 
 
 # --- agreement with diffusers ------------------------------------------------------------------------------------
@@ -258,6 +304,19 @@ def euler_difference(graph: Any, scene: Any, steps: int, strength: float, row: s
     theirs = diffusers_painter(graph.mini, row, 3.0, 0.5).paint(asked, Recorder()).balls
     ours = paint(graph, asked, sampler="euler", cfg=3.0, control_strength=0.5).balls
     return float((ours - theirs).abs().mean()), float(theirs.std())
+
+
+@pytest.mark.parametrize(("strength", "until"), [(1.0, 0.1), (1.0, 0.5), (0.8, 0.7)])
+def test_early_answers_agree_with_diffusers_on_trained_weights(
+    trained_graph: Any, mini_scene: Any, leading_euler: str, strength: float, until: float
+) -> None:
+    """At the same step, by the project's bar; the two compute the clean image each in its own units."""
+    asked = request(mini_scene, (0, 1), strength, 10, until)
+    theirs = diffusers_painter(trained_graph.mini, leading_euler, 3.0, 0.5).paint(asked, Recorder())
+    ours = paint(trained_graph, asked, sampler="euler", cfg=3.0, control_strength=0.5)
+    assert ours.evaluations == theirs.evaluations
+    assert theirs.balls.std() > 0.05
+    assert (ours.balls - theirs.balls).abs().mean() <= 1e-2
 
 
 SCHEDULES = pytest.mark.parametrize(("steps", "strength"), [(6, 1.0), (10, 0.8)])
