@@ -181,14 +181,14 @@ class DiffusersPainter:
         """
         require_canvas(request.canvas, request.ball)
         spent, notes = list[int](), list[str]()
-        encoded = self._encode(request.canvas)
+        encoded = self.encode(request.canvas)
 
         def counted(evaluations: int) -> None:
             spent.append(evaluations)
             observer.evaluated(evaluations)
 
         def paint(seeds: tuple[int, ...]) -> BallImage:
-            return self._decode_ball(self._inpaint(request, encoded, hint, seeds, counted), request.ball)
+            return self.decode_ball(self._inpaint(request, encoded, hint, seeds, counted), request.ball)
 
         try:
             with self._hint(request.depth) as hint:
@@ -201,6 +201,18 @@ class DiffusersPainter:
             )
             raise ModelError("model", f"{reason}: free memory there, or take a smaller canvas") from error
         return PaintResult(balls, sum(spent), tuple(notes))
+
+    @torch.no_grad()
+    def inpaint(self, request: PaintRequest, encoded: Any, counted: Callable[[int], None]) -> Tensor:
+        """Latents of a request's balls, not decoded, (n, 4, h, w); all are painted at once.
+
+        Args:
+            request: what to paint.
+            encoded: its canvas, as `encode` gives it, or anything else with `latents`, (1, 4, h, w).
+            counted: hears of the denoiser evaluations of each step.
+        """
+        with self._hint(request.depth) as hint:
+            return self._inpaint(request, encoded, hint, request.seeds, counted)
 
     def _inpaint(
         self, request: PaintRequest, encoded: Any, hint: Tensor, seeds: tuple[int, ...], counted: Callable[[int], None]
@@ -248,7 +260,8 @@ class DiffusersPainter:
         network = self.pipeline.unet if self.pipeline.controlnet is None else self.pipeline.controlnet
         return seen_once(self.pipeline.controlnet, depth.permute(0, 3, 1, 2).to(self._device, network.dtype))
 
-    def _encode(self, canvas: Image) -> Any:
+    @torch.no_grad()
+    def encode(self, canvas: Image) -> Any:
         """What the autoencoder makes of the canvas: latents, or a distribution to sample them from.
 
         The photograph comes back at every exposure, with a composite in between, so the last two are kept.
@@ -351,7 +364,9 @@ class DiffusersPainter:
             )
         return self._embeddings[prompt]
 
-    def _decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
+    @torch.no_grad()
+    def decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
+        """Balls cut out of painted latents, (n, 4, h, w) -> (n, D, D, 3) in [0, 1]."""
         vae = self.pipeline.vae
 
         def decode(part: Tensor) -> Image:

@@ -20,6 +20,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "metrics": Subcommand("score a picture against the true one", f"{__package__}.pairs"),
     "steering": Subcommand("how well exposures follow the EV asked for", f"{__package__}.steering"),
     "pareto": Subcommand("error against cost over schedules, as a chart", f"{__package__}.pareto"),
+    "early": Subcommand("what medians lose and save that stop denoising early", f"{__package__}.early"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
 }
 """The benches by name; a new one is a new row."""

@@ -1,0 +1,159 @@
+"""Medians of latents: whether they stand for medians of pictures, and what not decoding would save.
+
+One round from noise at EV 0, its median taken both ways, and one ball painted from each by SDEdit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+from time import perf_counter
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor
+
+from ..backends.diffusers_painter import DiffusersPainter, ball_latent_mask
+from ..ball import Ball, paste_ball
+from ..errors import OptionError
+from ..median import pixelwise_median
+from ..painter import PaintRequest
+from .early_section import Scene, Section, ball_rmse
+from .paintings import VARIANTS
+from .report import Column, Row
+
+__all__ = ["LatentsSection", "latent_median"]
+
+
+def latent_median(latents: Tensor) -> Tensor:
+    """Median of N latents by element, (n, k, h, w) -> (1, k, h, w), as `pixelwise_median` takes it."""
+    return pixelwise_median(latents.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class LatentsSection(Section):
+    """Medians of latents against medians of decoded balls."""
+
+    summary = "medians of latents against medians of pictures"
+    rows = (
+        Column("panorama", "panorama"),
+        Column("latents differ", "latents_differ", ".3f"),
+        Column("medians differ", "medians_differ", ".4f"),
+        Column("balls differ", "balls_differ", ".4f"),
+        Column("error, pixels", "pixel_rmse", ".4f"),
+        Column("error, latents", "latent_rmse", ".4f"),
+        Column("saved", "saved", ".1%"),
+    )
+    columns = (
+        Column("panoramas", "panoramas"),
+        Column("latents differ", "latents_differ", ".3f"),
+        Column("there and back", "there_and_back", ".3f"),
+        Column("medians differ", "medians_differ", ".4f"),
+        Column("seeds differ", "seeds_differ", ".4f"),
+        Column("balls differ", "balls_differ", ".4f"),
+        Column("median error, pixels", "pixel_median_rmse", ".4f"),
+        Column("latents", "latent_median_rmse", ".4f"),
+        Column("ball error, pixels", "pixel_rmse", ".4f"),
+        Column("latents", "latent_rmse", ".4f"),
+        Column("worse on", "worse"),
+        Column("denoising s", "denoising_s", ".2f"),
+        Column("decoding s", "decoding_s", ".3f"),
+        Column("encoding s", "encoding_s", ".3f"),
+        Column("saved", "saved", ".1%"),
+        Column("of early", "saved_early", ".1%"),
+    )
+
+    @property
+    def each(self) -> int:
+        """One row a panorama."""
+        return 1
+
+    @torch.no_grad()
+    def measure(self, path: Path) -> list[Row]:
+        """Both medians and the balls painted from them.
+
+        Raises:
+            OptionError: a painter without latents.
+        """
+        scene, options = Scene.of(path, self._studio), self._options
+        painter = self._studio.painter_of(VARIANTS["both"], scene.shot)
+        if not isinstance(painter, DiffusersPainter):
+            raise OptionError("--painter", type(painter).__name__, "a painter on diffusers for the section latents")
+        ball, seconds = scene.request.ball, dict[str, float]()
+
+        def timed(what: str, work: Callable[[], Tensor]) -> Tensor:
+            started = perf_counter()
+            done = work()
+            seconds[what] = perf_counter() - started
+            return done
+
+        seeds = tuple(range(options.seed, options.seed + options.balls))
+        asked = replace(scene.request, seeds=seeds, steps=options.steps)
+        photograph = painter.encode(asked.canvas)
+        latents = timed("denoising", lambda: painter.inpaint(asked, photograph, lambda count: None))
+        balls = timed("decoding", lambda: painter.decode_ball(latents, ball))
+        canvas = timed("pixels", lambda: paste_ball(asked.canvas, pixelwise_median(balls), ball))
+        known = timed("encoding", lambda: _latents_of(painter, canvas))
+        middle = timed("latents", lambda: latent_median(latents))
+
+        again = replace(asked, seeds=seeds[:1], strength=options.strength)
+        answers = [self._ball(painter, again, clean, seeds[0]) for clean in (known, middle)]
+        other = self._ball(painter, again, known, seeds[0] + options.balls)
+        truth, medians = scene.true_ball(0.0), (pixelwise_median(balls), painter.decode_ball(middle, ball))
+        saved = seconds["decoding"] + seconds["pixels"] + seconds["encoding"] - seconds["latents"]
+        there_and_back = _latents_of(painter, paste_ball(asked.canvas, medians[1], ball))
+        early = min(options.untils)
+        return [
+            {
+                "panorama": path.stem,
+                "latents_differ": _differ(middle, known, ball),
+                "there_and_back": _differ(middle, there_and_back, ball),
+                "medians_differ": ball_rmse(*medians),
+                "seeds_differ": ball_rmse(answers[0], other),
+                "balls_differ": ball_rmse(*answers),
+                "pixel_median_rmse": ball_rmse(medians[0], truth),
+                "latent_median_rmse": ball_rmse(medians[1], truth),
+                "pixel_rmse": ball_rmse(answers[0], truth),
+                "latent_rmse": ball_rmse(answers[1], truth),
+                **{f"{what}_s": spent for what, spent in seconds.items()},
+                "saved": saved / (saved + seconds["denoising"]),
+                "saved_early": saved / (saved + early * seconds["denoising"]),
+            }
+        ]
+
+    def _ball(self, painter: DiffusersPainter, request: PaintRequest, clean: Tensor, seed: int) -> Tensor:
+        """SDEdit from clean latents of a canvas."""
+        encoded = SimpleNamespace(latents=clean / painter.pipeline.vae.config.scaling_factor)
+        return painter.decode_ball(painter.inpaint(replace(request, seeds=(seed,)), encoded, lambda count: None), request.ball)
+
+    def summarize(self, rows: list[Row]) -> list[Row]:
+        """Means over panoramas, and on how many of them the ball from latents is the worse one."""
+        keys = [key for key in rows[0] if key != "panorama"]
+        worse = sum(row["latent_rmse"] > row["pixel_rmse"] for row in rows)
+        return [{"panoramas": len(rows), "worse": worse, **{key: fmean(row[key] for row in rows) for key in keys}}]
+
+    def protocol(self) -> Row:
+        """What was measured how."""
+        return {
+            "latents differ": "distance of SDEdit's two starts inside the disc, over the contrast of the pixels' one",
+            "there and back": "the same of the median of latents and what decoding and encoding makes of it",
+            "balls differ": "RMSE of the balls painted from them; seeds differ: of two seeds from one start",
+            "error": "RMSE from the true ball, display-encoded",
+            "saved": "share of a round's time that decoding, median of pictures and encoding take over that of latents",
+            "of early": f"the same where medians stop after {min(self._options.untils):g} of the schedule",
+        }
+
+
+def _differ(one: Tensor, other: Tensor, ball: Ball) -> float:
+    """Distance of two latents inside the ball's disc, over the other's contrast there."""
+    inside = ball_latent_mask(replace(ball, dilation=0)).to(other) == 1
+    first, second = (latents[inside.expand_as(latents)].view(latents.shape[1], -1) for latents in (one, other))
+    return float((first - second).norm() / (second - second.mean(dim=1, keepdim=True)).norm())
+
+
+def _latents_of(painter: DiffusersPainter, canvas: Tensor) -> Tensor:
+    """Clean latents of a canvas as the denoiser has them; the mode, where the autoencoder has one."""
+    encoded = painter.encode(canvas)
+    latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents
+    return latents.float() * painter.pipeline.vae.config.scaling_factor
