@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 from time import perf_counter
 from types import SimpleNamespace
 
@@ -20,6 +20,7 @@ from ..ball import Ball, paste_ball
 from ..errors import OptionError
 from ..median import pixelwise_median
 from ..painter import PaintRequest
+from ..shapes import BallImage
 from .early_section import Scene, Section, ball_rmse
 from .paintings import VARIANTS
 from .report import Column, Row
@@ -80,7 +81,7 @@ class LatentsSection(Section):
         painter = self._studio.painter_of(VARIANTS["both"], scene.shot)
         if not isinstance(painter, DiffusersPainter):
             raise OptionError("--painter", type(painter).__name__, "a painter on diffusers for the section latents")
-        ball, seconds = scene.request.ball, dict[str, float]()
+        ball, seconds, spent = scene.request.ball, dict[str, float](), list[int]()
 
         def timed(what: str, work: Callable[[], Tensor]) -> Tensor:
             started = perf_counter()
@@ -91,15 +92,15 @@ class LatentsSection(Section):
         seeds = tuple(range(options.seed, options.seed + options.balls))
         asked = replace(scene.request, seeds=seeds, steps=options.steps)
         photograph = painter.encode(asked.canvas)
-        latents = timed("denoising", lambda: painter.inpaint(asked, photograph, lambda count: None))
+        latents = timed("denoising", lambda: painter.inpaint(asked, photograph, spent.append))
         balls = timed("decoding", lambda: painter.decode_ball(latents, ball))
         canvas = timed("pixels", lambda: paste_ball(asked.canvas, pixelwise_median(balls), ball))
         known = timed("encoding", lambda: _latents_of(painter, canvas))
         middle = timed("latents", lambda: latent_median(latents))
 
         again = replace(asked, seeds=seeds[:1], strength=options.strength)
-        answers = [self._ball(painter, again, clean, seeds[0]) for clean in (known, middle)]
-        other = self._ball(painter, again, known, seeds[0] + options.balls)
+        answers = [_sdedit(painter, again, clean, spent.append) for clean in (known, middle)]
+        other = _sdedit(painter, replace(again, seeds=(seeds[0] + options.balls,)), known, spent.append)
         truth, medians = scene.true_ball(0.0), (pixelwise_median(balls), painter.decode_ball(middle, ball))
         saved = seconds["decoding"] + seconds["pixels"] + seconds["encoding"] - seconds["latents"]
         there_and_back = _latents_of(painter, paste_ball(asked.canvas, medians[1], ball))
@@ -116,22 +117,20 @@ class LatentsSection(Section):
                 "latent_median_rmse": ball_rmse(medians[1], truth),
                 "pixel_rmse": ball_rmse(answers[0], truth),
                 "latent_rmse": ball_rmse(answers[1], truth),
-                **{f"{what}_s": spent for what, spent in seconds.items()},
+                **{f"{what}_s": value for what, value in seconds.items()},
                 "saved": saved / (saved + seconds["denoising"]),
                 "saved_early": saved / (saved + early * seconds["denoising"]),
+                "evaluations": sum(spent),
             }
         ]
 
-    def _ball(self, painter: DiffusersPainter, request: PaintRequest, clean: Tensor, seed: int) -> Tensor:
-        """SDEdit from clean latents of a canvas."""
-        encoded = SimpleNamespace(latents=clean / painter.pipeline.vae.config.scaling_factor)
-        return painter.decode_ball(painter.inpaint(replace(request, seeds=(seed,)), encoded, lambda count: None), request.ball)
-
     def summarize(self, rows: list[Row]) -> list[Row]:
-        """Means over panoramas, and on how many of them the ball from latents is the worse one."""
-        keys = [key for key in rows[0] if key != "panorama"]
-        worse = sum(row["latent_rmse"] > row["pixel_rmse"] for row in rows)
-        return [{"panoramas": len(rows), "worse": worse, **{key: fmean(row[key] for row in rows) for key in keys}}]
+        """Mean errors, median times, and on how many panoramas the ball from latents is the worse one."""
+        timed = [key for key in rows[0] if key.startswith("saved") or key.endswith("_s")]
+        compared = [key for key in rows[0] if key not in {"panorama", "evaluations", *timed}]
+        line: Row = {"panoramas": len(rows), "worse": sum(row["latent_rmse"] > row["pixel_rmse"] for row in rows)}
+        line |= {key: fmean(row[key] for row in rows) for key in compared}
+        return [line | {key: median(row[key] for row in rows) for key in timed}]
 
     def protocol(self) -> Row:
         """What was measured how."""
@@ -143,6 +142,14 @@ class LatentsSection(Section):
             "saved": "share of a round's time that decoding, median of pictures and encoding take over that of latents",
             "of early": f"the same where medians stop after {min(self._options.untils):g} of the schedule",
         }
+
+
+def _sdedit(
+    painter: DiffusersPainter, request: PaintRequest, clean: Tensor, counted: Callable[[int], None]
+) -> BallImage:
+    """The ball of a request, painted from clean latents of a canvas."""
+    encoded = SimpleNamespace(latents=clean / painter.pipeline.vae.config.scaling_factor)
+    return painter.decode_ball(painter.inpaint(request, encoded, counted), request.ball)
 
 
 def _differ(one: Tensor, other: Tensor, ball: Ball) -> float:

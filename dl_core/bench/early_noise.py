@@ -61,7 +61,7 @@ class NoiseSection(Section):
         if options.seeds <= options.balls:
             raise OptionError("--seeds", options.seeds, f"more than the {options.balls} of --balls")
         self._seeds = tuple(range(options.seed, options.seed + options.seeds))
-        self._painted: dict[str, tuple[BallImage, BallImage]] = {}
+        self._painted: dict[str, tuple[Tensor, Tensor]] = {}
 
     @property
     def each(self) -> int:
@@ -131,14 +131,14 @@ class NoiseSection(Section):
     def _place(self, name: str) -> Path | None:
         return None if self._options.out is None else self._options.out / "balls" / f"{name}.safetensors"
 
-    def _keep(self, name: str, balls: BallImage, truth: BallImage) -> None:
+    def _keep(self, name: str, balls: BallImage, truth: Float[Tensor, "1 d d c"]) -> None:
         """Before the rows are: they say that the balls are there."""
         self._painted[name], place = (balls, truth), self._place(name)
         if place is not None:
             place.parent.mkdir(parents=True, exist_ok=True)
             write_tensors(place, {"balls": balls, "truth": truth}, {})
 
-    def _found(self, name: str) -> tuple[BallImage, BallImage]:
+    def _found(self, name: str) -> tuple[Tensor, Tensor]:
         place = self._place(name)
         if name not in self._painted and place is not None:
             kept = load_file(place)
@@ -165,6 +165,6 @@ def _shuffled(line: Tensor, generator: torch.Generator) -> Tensor:
     return line[torch.randperm(len(line), generator=generator)]
 
 
-def _random_error(balls: BallImage, truth: BallImage, count: int, generator: torch.Generator) -> float:
+def _random_error(balls: BallImage, truth: Float[Tensor, "1 d d c"], count: int, generator: torch.Generator) -> float:
     draws = [torch.randperm(len(balls), generator=generator)[:count] for _ in range(DRAWS)]
     return fmean(ball_rmse(pixelwise_median(balls[draw]), truth) for draw in draws)
