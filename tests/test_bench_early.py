@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ from dl_core.backends.loading import ModelFiles
 from dl_core.bench.early_latents import LatentsSection, latent_median
 from dl_core.bench.early_noise import NoiseSection, rank_correlation, ranks
 from dl_core.bench.early_section import Options, Scene, ball_rmse
-from dl_core.bench.early_until import Remembering, UntilSection
+from dl_core.bench.early_until import UntilSection
 from dl_core.bench.painters import PAINTERS, Studio, open_studio
 from dl_core.bench.perfect import PerfectPainter
 from dl_core.cli import main
@@ -101,31 +101,6 @@ def test_cost_and_error_of_medians_that_stop_early(panoramas: list[Path]) -> Non
     summary = {(line["until"], line["final"]): line["ball_rmse_ratio"] for line in section.summarize(rows)}
     assert summary[1.0, True] == summary[1.0, False] == summary[0.5, True] == 1
     assert summary[0.5, False] > 2
-
-
-def test_a_remembered_request_counts_again_and_is_not_painted_again() -> None:
-    @dataclass
-    class Counting(PerfectPainter):
-        painted: int = 0
-
-        def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
-            self.painted += 1
-            return super().paint(request, observer)
-
-    painter = Counting(light(0))
-    once, asked = Remembering(painter), PaintRequest(*_canvas(), 0.0, (1, 2), steps=4)
-    first, again = (once.paint(asked, SilentObserver()) for _ in range(2))
-    assert first is again
-    assert (painter.painted, once.evaluations_spent) == (1, 2 * first.evaluations)
-    once.paint(replace(asked, until=0.5), SilentObserver())
-    assert painter.painted == 2
-
-
-def _canvas() -> tuple[Tensor, Tensor, object]:
-    from dl_core.ball import paint_depth, place_ball
-
-    ball = place_ball(64, 32)
-    return torch.zeros(1, 64, 64, 3), paint_depth(None, ball), ball
 
 
 # --- latents -----------------------------------------------------------------------------------------------------

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
     }
     journal = Journal(args.out, run_identity, section.each)
     for path in files:
-        if path.stem not in journal.done:
+        if not journal.has(path.stem):
             journal.add(section.measure(path))
     report = Report(
         f"early, {args.section}",

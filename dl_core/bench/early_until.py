@@ -5,56 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
-from time import perf_counter
 from typing import Final
 
 from ..estimate import Probe, Settings, estimate
-from ..finished import content_key
 from ..iterative import Rounds
-from ..painter import Observer, Painter, PaintRequest, PaintResult
 from ..presets import PAPER_EVS
 from .early_section import Options, Scene, Section, ball_rmse
 from .painters import Studio
 from .paintings import VARIANTS
 from .report import Column, Row
 from .scoring import SPHERES, score_maps
+from .shared_balls import SharedBalls
 
-__all__ = ["Remembering", "UntilSection"]
+__all__ = ["UntilSection"]
 
 CONVENTION: Final = "published"
 _FIGURES: Final = ("ball_rmse", "dark_rmse", *(f"{sphere}_{error}" for sphere in SPHERES for error in ("si", "deg")))
-
-
-class Remembering:
-    """A painter that paints no request twice, and counts evaluations and seconds of each request as often as asked.
-
-    So variants that share rounds cost what they would cost alone, and are painted once.
-
-    Attributes:
-        evaluations_spent: by the requests answered so far.
-        seconds: the same in time.
-    """
-
-    def __init__(self, painter: Painter) -> None:
-        self._painter = painter
-        self._known: dict[str, tuple[PaintResult, float]] = {}
-        self.evaluations_spent, self.seconds = 0, 0.0
-
-    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
-        """See `painter.Painter`."""
-        return self._painter.evaluations(balls, steps, strength, until)
-
-    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
-        """See `painter.Painter`."""
-        key = content_key(request)
-        if key not in self._known:
-            started = perf_counter()
-            result = self._painter.paint(request, observer)
-            self._known[key] = result, perf_counter() - started
-        result, seconds = self._known[key]
-        self.evaluations_spent += result.evaluations
-        self.seconds += seconds
-        return result
 
 
 class UntilSection(Section):
@@ -102,13 +68,13 @@ class UntilSection(Section):
         painter = self._studio.painter_of(VARIANTS["both"], scene.shot)
         options, rows = self._options, list[Row]()
         for until in options.untils:
-            once = Remembering(painter)
+            shared = SharedBalls(painter)
             for final in (True, False):
-                once.evaluations_spent, once.seconds = 0, 0.0
+                before = shared.seconds
                 rounds = Rounds(options.balls, options.rounds, options.strength, options.steps, final, until)
-                probe = estimate(scene.shot.photo_ldr, once, replace(self._settings, rounds=rounds))
+                probe = estimate(scene.shot.photo_ldr, shared, replace(self._settings, rounds=rounds))
                 row = {"panorama": path.stem, "until": until, "final": final}
-                cost = {"evaluations": once.evaluations_spent, "seconds": once.seconds}
+                cost = {"evaluations": probe.evaluations, "seconds": shared.seconds - before}
                 rows.append({**row, **cost, **_errors(scene, probe)})
         return rows
 

@@ -36,9 +36,9 @@ class SharedBalls:
         self._cost: dict[tuple[str, int], tuple[float, int]] = {}
         self.seconds = 0.0
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
         """See `painter.Painter`."""
-        return self._painter.evaluations(balls, steps, strength)
+        return self._painter.evaluations(balls, steps, strength, until)
 
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
         """See `painter.Painter`."""
