@@ -1,5 +1,8 @@
 """Iterative inpainting: N balls, their median, and again from there.
 
+With a tolerance a round ends once its median is settled (`settling`), N being the most that it paints; balls that are
+not like the others (`outliers`) are left out of the median.
+
 Source: DiffusionLight, Algorithm 1 and Sec. 4.1.
 """
 
@@ -7,17 +10,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .ball import paint_depth, paste_ball
+from .ball import Ball, crop_ball, disc_mask, paint_depth, paste_ball
 from .errors import OptionError
 from .median import pixelwise_median, pixelwise_spread
+from .outliers import find_outliers
 from .painter import Observer, Painter, PaintRequest, SilentObserver
-from .shapes import BallImage, Image
+from .settling import CONFIDENCE, error_bound, looks
+from .shapes import BallImage, Image, Mask
 
-__all__ = ["IterativeResult", "Rounds", "iterative_inpaint", "rounds_evaluations"]
+__all__ = [
+    "IterativeResult",
+    "Rounds",
+    "SparingObserver",
+    "Tally",
+    "iterative_inpaint",
+    "rounds_evaluations",
+    "tell_spared",
+]
 
 
 @dataclass(frozen=True)
@@ -25,12 +40,15 @@ class Rounds:
     """The schedule of Algorithm 1.
 
     Attributes:
-        balls: N, balls in a median.
+        balls: N, balls in a median; the most, where there is a tolerance.
         rounds: k, medians taken. With 0 one ball is painted from noise and that is all (the paper's base model).
         strength: γ, share of the schedule that later rounds and the last ball run.
         steps: denoising steps of a full schedule.
         final: whether one more ball is painted from the last median (the paper does); without it the last median is
             the answer, at no more cost, but softer.
+        tolerance: error that a median may have, as `settling.error_bound` bounds it, in display values; a round ends
+            once its median is within. Without one every round paints N balls.
+        minimum: fewest balls of a round with a tolerance, N being the most in any case.
     """
 
     balls: int = 30
@@ -38,6 +56,8 @@ class Rounds:
     strength: float = 0.8
     steps: int = 30
     final: bool = True
+    tolerance: float | None = None
+    minimum: int = 6
 
     def __post_init__(self) -> None:
         if not 1 <= self.balls <= 1000:
@@ -48,6 +68,44 @@ class Rounds:
             raise OptionError("strength", self.strength, "above 0, up to 1")
         if not 1 <= self.steps <= 1000:
             raise OptionError("steps", self.steps, "1 to 1000")
+        if self.tolerance is not None and not 0 < self.tolerance < 1:
+            raise OptionError("tolerance", self.tolerance, "above 0, below 1, in display values; or none")
+        if not 3 <= self.minimum <= 1000:
+            raise OptionError("minimum", self.minimum, "3 to 1000")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of balls after which a round's median is looked at; N alone without a tolerance."""
+        return (self.balls,) if self.tolerance is None else looks(self.minimum, self.balls)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What became of a round.
+
+    Attributes:
+        painted: balls painted.
+        left_out: seeds of those that are not in the median, being unlike the others; none without a tolerance.
+        error: bound on the median's error when the round ended, see `settling.error_bound`; None without a tolerance.
+    """
+
+    painted: int
+    left_out: tuple[int, ...] = ()
+    error: float | None = None
+
+
+@runtime_checkable
+class SparingObserver(Observer, Protocol):
+    """An observer that also hears of evaluations that were planned and are not needed."""
+
+    def spared(self, count: int) -> None:
+        """`count` denoiser evaluations of those planned will not be done."""
+
+
+def tell_spared(observer: Observer, count: int) -> None:
+    """Tell an observer of evaluations that are not needed, if it wants to hear."""
+    if count and isinstance(observer, SparingObserver):
+        observer.spared(count)
 
 
 @dataclass(frozen=True)
@@ -57,9 +115,10 @@ class IterativeResult:
     Attributes:
         ball: (1, D, D, 3) the answer, display-encoded.
         median: (1, D, D, 3) the last median it was painted from; the ball itself if no median was taken.
-        spread: (1, D, D, 3) median absolute deviation of the last round's balls.
-        balls: (N, D, D, 3) the last round's balls.
+        spread: (1, D, D, 3) median absolute deviation of the balls in the last median.
+        balls: (N, D, D, 3) the balls in the last median.
         evaluations: denoiser evaluations spent.
+        tallies: what became of each round.
         notes: what the painter had to say (`painter.PaintResult`), in order.
     """
 
@@ -69,6 +128,7 @@ class IterativeResult:
     balls: Float[Tensor, "n d d c"]
     evaluations: int
     notes: tuple[str, ...] = ()
+    tallies: tuple[Tally, ...] = ()
 
 
 def iterative_inpaint(
@@ -78,6 +138,7 @@ def iterative_inpaint(
     observer: Observer | None = None,
     *,
     depth_of: Callable[[Image], Image] | None = None,
+    used: Mask | None = None,
 ) -> IterativeResult:
     """Paint a ball by iterative inpainting (Algorithm 1).
 
@@ -85,11 +146,13 @@ def iterative_inpaint(
         painter: paints balls.
         request: canvas, depth, ball, EV and first seed; ball j of every round uses the first seed + j. Its strength
             and steps are replaced by those of `rounds`.
-        rounds: N, k, γ and steps.
+        rounds: N, k, γ and steps, and the tolerance if N is to depend on the balls.
         observer: hears of progress; may stop the run by raising.
         depth_of: depth of a canvas, (1, S, S, 3) -> (1, h, w, 1 or 3), near is bright. With it every median's composite
             gets a depth map of its own, as in the authors' code; without it all rounds use the request's, which the
             first round uses in any case.
+        used: (1, D, D) how much of each pixel the merge will use, 0 or more: where a tolerance is to be kept. All of
+            the disc alike when not given.
 
     Returns:
         The ball with the median, the spread and the cost. Each median is pasted on the original photograph, not on
@@ -97,8 +160,9 @@ def iterative_inpaint(
     """
     observer = observer or SilentObserver()
     seed = request.seeds[0]
-    seeds = tuple(seed + j for j in range(rounds.balls))
-    scene, spent, notes = request, list[int](), list[str]()
+    disc = _disc(request.ball)
+    weight = disc if used is None else disc * used[0]
+    scene, spent, notes, tallies = request, list[int](), list[str](), list[Tally]()
 
     def inpaint_balls(wanted: tuple[int, ...], strength: float) -> BallImage:
         asked = replace(scene, seeds=wanted, strength=strength, steps=rounds.steps)
@@ -107,8 +171,30 @@ def iterative_inpaint(
         notes.extend(result.notes)
         return result.balls
 
+    def inpaint_round(i: int) -> BallImage:
+        """The balls that a median is taken of."""
+        strength = rounds.strength if i > 0 else 1.0
+        painted = list[BallImage]()
+        count = 0
+        for wanted in rounds.counts:
+            painted.append(inpaint_balls(tuple(range(seed + count, seed + wanted)), strength))
+            count, balls = wanted, torch.cat(painted)
+            observer.painted(request.ev, i, balls)
+            if rounds.tolerance is None:
+                tallies.append(Tally(count))
+                return balls
+            strange = find_outliers(balls, disc)
+            balls = balls[~strange]
+            error = error_bound(balls, weight, 1 - (1 - CONFIDENCE) / len(rounds.counts))
+            if error <= rounds.tolerance:
+                break
+        tallies.append(Tally(count, tuple(seed + j for j in strange.nonzero()[:, 0].tolist()), error))
+        tell_spared(observer, painter.evaluations(rounds.balls - count, rounds.steps, strength))
+        return balls
+
     def found(ball: BallImage, median: BallImage, balls: Float[Tensor, "n d d c"]) -> IterativeResult:
-        return IterativeResult(ball, median, pixelwise_spread(balls), balls, sum(spent), tuple(notes))
+        spread = pixelwise_spread(balls)
+        return IterativeResult(ball, median, spread, balls, sum(spent), tuple(notes), tuple(tallies))
 
     if rounds.rounds == 0:
         ball = inpaint_balls((seed,), 1.0)
@@ -116,12 +202,16 @@ def iterative_inpaint(
         return found(ball, ball, ball)
 
     for i in range(rounds.rounds):
-        balls = inpaint_balls(seeds, rounds.strength if i > 0 else 1.0)
+        balls = inpaint_round(i)
         median = pixelwise_median(balls)
-        observer.painted(request.ev, i, balls)
         scene = _with_median(request, median, depth_of)
     ball = inpaint_balls((seed,), rounds.strength) if rounds.final else median
     return found(ball, median, balls)
+
+
+def _disc(ball: Ball) -> Float[Tensor, "d d"]:
+    """1 where a pixel of the crop is the ball's, 0 outside."""
+    return crop_ball(disc_mask(ball)[..., None], ball)[0, ..., 0]
 
 
 def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[Image], Image] | None) -> PaintRequest:
@@ -132,7 +222,7 @@ def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[I
 
 
 def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:
-    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure, exactly."""
+    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure: exactly, or with a tolerance at most."""
     if rounds.rounds == 0:
         return painter.evaluations(1, rounds.steps, 1.0)
     first = painter.evaluations(rounds.balls, rounds.steps, 1.0)
