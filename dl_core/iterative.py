@@ -31,6 +31,7 @@ __all__ = [
     "Tally",
     "iterative_inpaint",
     "rounds_evaluations",
+    "tally_lines",
     "tell_spared",
 ]
 
@@ -229,3 +230,19 @@ def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:
     again = painter.evaluations(rounds.balls, rounds.steps, rounds.strength) * (rounds.rounds - 1)
     last = painter.evaluations(1, rounds.steps, rounds.strength) if rounds.final else 0
     return first + again + last
+
+
+def tally_lines(result: IterativeResult, rounds: Rounds) -> list[str]:
+    """What a report should say of rounds with a tolerance, one sentence a round; nothing without one."""
+    lines = []
+    for number, tally in enumerate(result.tallies, 1):
+        if rounds.tolerance is None or tally.error is None:
+            continue
+        verdict = "settled" if tally.error <= rounds.tolerance else "not settled"
+        line = (
+            f"round {number}: {verdict} after {tally.painted} of at most {rounds.balls} balls, median within "
+            f"{tally.error:.3f} for a tolerance of {rounds.tolerance:g}"
+        )
+        seeds = ", ".join(map(str, tally.left_out))
+        lines.append(f"{line}; left out as unlike the others: seeds {seeds}" if seeds else line)
+    return lines

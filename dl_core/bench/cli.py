@@ -19,6 +19,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "fit": Subcommand("how well radius and centre of a painted ball are found", f"{__package__}.fit"),
     "metrics": Subcommand("score a picture against the true one", f"{__package__}.pairs"),
     "steering": Subcommand("how well exposures follow the EV asked for", f"{__package__}.steering"),
+    "bracket": Subcommand("what a scene-sized bracket keeps and costs", f"{__package__}.bracket"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
 }
 """The benches by name; a new one is a new row."""
