@@ -140,8 +140,8 @@ def planned_evs(settings: Settings, painter: Painter | None = None) -> tuple[flo
 def planned_evaluations(painter: Painter, settings: Settings) -> int:
     """Denoiser evaluations that `estimate` will spend.
 
-    Exactly, with a fixed bracket and no tolerance; otherwise at most. An `iterative.SparingObserver` hears of those that
-    turn out not to be needed, so that the two together are what was planned.
+    Exactly, with a fixed bracket and no tolerance; otherwise at most. An `iterative.SparingObserver` hears of those
+    that turn out not to be needed, so that the two together are what was planned.
     """
     return rounds_evaluations(painter, settings.rounds) * len(planned_evs(settings, painter))
 
@@ -210,8 +210,8 @@ def _paint_bracket(
 ) -> tuple[IterativeResult, ...]:
     """Paint exposures from the brightest on: all of them, or as many as the scene needs.
 
-    Where a median is to keep a tolerance it does so where the merge will use it: at EV 0 on the whole ball, further down
-    where all brighter exposures clip.
+    Where a median is to keep a tolerance it does so where the merge will use it: at EV 0 on the whole ball, further
+    down where all brighter exposures clip.
     """
     exposures: list[IterativeResult] = []
     used = None
@@ -225,9 +225,7 @@ def _paint_bracket(
                 break
             used = (hidden > 0).any(dim=-1).to(hidden)
         asked = replace(request, ev=ev)
-        exposures.append(
-            iterative_inpaint(painter, asked, settings.rounds, observer, depth_of=depth_of, used=used)
-        )
+        exposures.append(iterative_inpaint(painter, asked, settings.rounds, observer, depth_of=depth_of, used=used))
     tell_spared(observer, rounds_evaluations(painter, settings.rounds) * (len(evs) - len(exposures)))
     return tuple(exposures)
 

@@ -223,7 +223,7 @@ def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[I
 
 
 def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:
-    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure: exactly, or with a tolerance at most."""
+    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure: exactly, with a tolerance at most."""
     if rounds.rounds == 0:
         return painter.evaluations(1, rounds.steps, 1.0)
     first = painter.evaluations(rounds.balls, rounds.steps, 1.0)

@@ -63,7 +63,9 @@ def looks(minimum: int, maximum: int) -> tuple[int, ...]:
     return tuple(counts)
 
 
-def low_pass(balls: BallImage, weight: Float[Tensor, "d d"]) -> tuple[Float[Tensor, "n cells c"], Float[Tensor, "cells"]]:
+def low_pass(
+    balls: BallImage, weight: Float[Tensor, "d d"]
+) -> tuple[Float[Tensor, "n cells c"], Float[Tensor, "cells"]]:
     """Means of balls over cells, and the share of the weight that each cell has.
 
     Args:

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         type=float,
         help="error a median may have, in display values, such as 0.02: a round ends once its median is within, and "
-        "leaves out balls unlike the others; the preset's balls are the most (default: the preset's balls, all of them)",
+        "leaves out balls unlike the others; the preset's balls are the most it paints (default: it paints them all)",
     )
     add("--min-balls", type=int, default=6, help="with --tolerance, the fewest balls of a round (default: 6)")
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")

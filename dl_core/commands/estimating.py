@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -23,7 +24,7 @@ from ..errors import OptionError
 from ..estimate import Probe, Settings, bracket_remarks, estimate, planned_evaluations
 from ..exposure import check_evs, check_merge
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
-from ..iterative import Rounds, tally_lines
+from ..iterative import Rounds, Tally, tally_lines
 from ..painter import IMPUTINGS, Painter, SilentObserver
 from ..presets import preset
 from ..shapes import Image
@@ -209,7 +210,7 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
             "backend": args.backend,
             "merge": args.merge,
             "evs": list(probe.evs),
-            "rounds": {f"{ev:g}": [asdict(t) for t in e.tallies] for ev, e in zip(probe.evs, probe.exposures, strict=True)},
+            "rounds": [[_tally(tally) for tally in exposure.tallies] for exposure in probe.exposures],
             "clipped": probe.clipped,
             "seed": args.seed,
             "version": __version__,
@@ -224,6 +225,12 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
     peak = "" if memory is None else f", {memory / 2**30:.2f} GiB at the peak"
     took = f"{seconds['painting']:.1f} s, {seconds['total']:.1f} s in all"
     print(f"{probe.evaluations} denoiser evaluations in {took}{peak}")
+
+
+def _tally(tally: Tally) -> dict[str, Any]:
+    """As JSON has it, which knows no infinity."""
+    error = None if tally.error is None or math.isinf(tally.error) else tally.error
+    return {**asdict(tally), "error": error}
 
 
 def _doubts(args: argparse.Namespace) -> list[str]:
