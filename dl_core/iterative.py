@@ -72,7 +72,7 @@ class Rounds:
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise OptionError("tolerance", self.tolerance, "above 0, below 1, in display values; or none")
         if not 3 <= self.minimum <= 1000:
-            raise OptionError("minimum", self.minimum, "3 to 1000")
+            raise OptionError("minimum", self.minimum, "3 to 1000 balls")
 
     @property
     def counts(self) -> tuple[int, ...]:

@@ -241,7 +241,9 @@ FIXED_12 = Rounds(balls=12, rounds=1, steps=1, final=False)
 
 
 def test_without_a_tolerance_rounds_are_told_of_and_nothing_is_left_out() -> None:
-    result = iterative_inpaint(AnalyticPainter(LIGHT, Flaws(disco=0.3)), request(), replace(FIXED_12, rounds=2, steps=2))
+    result = iterative_inpaint(
+        AnalyticPainter(LIGHT, Flaws(disco=0.3)), request(), replace(FIXED_12, rounds=2, steps=2)
+    )
     assert result.tallies == (Tally(12), Tally(12))
     assert tally_lines(result, FIXED_12) == []
 
