@@ -6,22 +6,35 @@ Source: DiffusionLight, Fig. 2 (overview) and Sec. 4.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .ball import Ball, fit_canvas, paint_depth, paste_ball, place_ball
+from .ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, paste_ball, place_ball
+from .bracket import check_bracket, darkest_of, hidden_radiance, ladder
 from .errors import ImageError, OptionError
 from .exposure import check_evs, check_merge, merge_bracket
 from .geometry import ball_to_latlong
-from .iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations
-from .painter import Observer, Painter, PaintRequest
+from .iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations, tell_spared
+from .painter import Observer, Painter, PaintRequest, SilentObserver
 from .presets import PAPER_EVS
 from .shapes import BallImage, Image, Latlong
 
-__all__ = ["Probe", "Settings", "check_photograph", "estimate", "planned_evaluations"]
+__all__ = [
+    "Probe",
+    "Settings",
+    "bracket_remarks",
+    "check_photograph",
+    "estimate",
+    "planned_evaluations",
+    "planned_evs",
+]
+
+HIDDEN_SHARE: Final = 0.01
+"""Share of the energy known that a scene-sized bracket may leave hidden: 0.014 stops."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +44,11 @@ class Settings:
     Attributes:
         rounds: schedule of iterative inpainting, run at every EV.
         evs: exposure values, descending from 0.
+        bracket: of `bracket.BRACKETS`. `fixed` paints every EV. `scene` paints EV 0, and the next darker one only where
+            the last one clips so much that darker ones could add over 1% of the energy known (`HIDDEN_SHARE`); after
+            the last of `evs` it goes on at the same distance down to `darkest`.
+        darkest: EV at which a scene-sized bracket ends. When None, that which the painter was made for
+            (`bracket.darkest_of`); a lower one asks a model for what it was not trained on.
         seed: of the first ball; the same at every EV, so that exposures share their noise.
         merge: method of `exposure.MERGES`.
         canvas: side of the square the photograph is fitted in, pixels.
@@ -51,6 +69,8 @@ class Settings:
     y: float | None = None
     height: int = 256
     depth_disc: str = "ball"
+    bracket: str = "fixed"
+    darkest: float | None = None
 
 
 @dataclass(frozen=True)
@@ -60,20 +80,24 @@ class Probe:
     Attributes:
         latlong_hdr: (1, H, 2H, 3) linear radiance; EV 0 white is 1.
         ball_hdr: (1, D, D, 3) linear radiance.
-        exposures: the result at each EV, in the order of `settings.evs`.
+        evs: exposure values painted, descending from 0.
+        exposures: the result at each of them.
         composite_ldr: (1, S, S, 3) the photograph with the EV 0 ball, display-encoded.
         ball: where the ball sits.
         settings: what was asked for.
         evaluations: denoiser evaluations spent.
+        clipped: share of the ball that the darkest exposure still shows clipped, where lights end at its white.
     """
 
     latlong_hdr: Latlong
     ball_hdr: BallImage
+    evs: tuple[float, ...]
     exposures: tuple[IterativeResult, ...]
     composite_ldr: Float[Tensor, "b s s c"]
     ball: Ball
     settings: Settings
     evaluations: int
+    clipped: float
 
 
 def check_photograph(photo_ldr: Image, source: str = "photograph") -> Image:
@@ -98,9 +122,28 @@ def check_photograph(photo_ldr: Image, source: str = "photograph") -> Image:
     return photo_ldr
 
 
+def planned_evs(settings: Settings, painter: Painter | None = None) -> tuple[float, ...]:
+    """Exposures that `estimate` will paint: all of them, or with a scene-sized bracket the first so many as it needs.
+
+    Args:
+        settings: bracket and its darkest EV.
+        painter: may have a darkest EV of its own, which counts where the settings name none.
+
+    Raises:
+        OptionError: EVs, a bracket or a darkest EV that are not accepted.
+    """
+    if check_bracket(settings.bracket) == "fixed":
+        return check_evs(settings.evs)
+    return ladder(settings.evs, darkest_of(painter) if settings.darkest is None else settings.darkest)
+
+
 def planned_evaluations(painter: Painter, settings: Settings) -> int:
-    """Denoiser evaluations that `estimate` will spend, exactly."""
-    return rounds_evaluations(painter, settings.rounds) * len(settings.evs)
+    """Denoiser evaluations that `estimate` will spend.
+
+    Exactly, with a fixed bracket and no tolerance; otherwise at most. An `iterative.SparingObserver` hears of those
+    that turn out not to be needed, so that the two together are what was planned.
+    """
+    return rounds_evaluations(painter, settings.rounds) * len(planned_evs(settings, painter))
 
 
 def estimate(
@@ -129,8 +172,9 @@ def estimate(
         OptionError: an option out of range, named.
         ModelError: what the painter raises about its model.
     """
+    observer = observer or SilentObserver()
     photo_ldr = check_photograph(photo_ldr)
-    evs = check_evs(settings.evs)
+    evs = planned_evs(settings, painter)
     check_merge(settings.merge)
     if settings.height < 2:
         raise OptionError("height", settings.height, "2 or more rows")
@@ -138,18 +182,78 @@ def estimate(
     canvas = fit_canvas(photo_ldr, settings.canvas)
     if depth is None and depth_of is not None:
         depth = depth_of(canvas)
-    control = paint_depth(depth, ball)
-    requests = [PaintRequest(canvas, control, ball, ev, (settings.seed,)) for ev in evs]
-    exposures = tuple(
-        iterative_inpaint(painter, request, settings.rounds, observer, depth_of=depth_of) for request in requests
-    )
-    ball_hdr = merge_bracket([exposure.ball for exposure in exposures], evs, settings.merge)
+    request = PaintRequest(canvas, paint_depth(depth, ball), ball, 0.0, (settings.seed,))
+    exposures = _paint_bracket(painter, request, settings, evs, observer, depth_of)
+    painted = evs[: len(exposures)]
+    balls = [exposure.ball for exposure in exposures]
+    ball_hdr = merge_bracket(balls, painted, settings.merge)
     return Probe(
         latlong_hdr=ball_to_latlong(ball_hdr, settings.height, painted=True),
         ball_hdr=ball_hdr,
+        evs=painted,
         exposures=exposures,
         composite_ldr=paste_ball(canvas, exposures[0].ball, ball),
         ball=ball,
         settings=settings,
         evaluations=sum(exposure.evaluations for exposure in exposures),
+        clipped=_clipped_share(balls, painted, settings.merge, ball),
     )
+
+
+def _paint_bracket(
+    painter: Painter,
+    request: PaintRequest,
+    settings: Settings,
+    evs: tuple[float, ...],
+    observer: Observer,
+    depth_of: Callable[[Image], Image] | None,
+) -> tuple[IterativeResult, ...]:
+    """Paint exposures from the brightest on: all of them, or as many as the scene needs.
+
+    Where a median is to keep a tolerance it does so where the merge will use it: at EV 0 on the whole ball, further
+    down where all brighter exposures clip.
+    """
+    exposures: list[IterativeResult] = []
+    used = None
+    looks_at_clipping = settings.bracket == "scene" or settings.rounds.tolerance is not None
+    for ev in evs:
+        if exposures and looks_at_clipping:
+            balls, brighter = [exposure.ball for exposure in exposures], evs[: len(exposures)]
+            hidden = hidden_radiance(balls, brighter, evs[-1], settings.merge)
+            known = merge_bracket(balls, brighter, settings.merge)
+            if settings.bracket == "scene" and not _matters(hidden, known, request.ball):
+                break
+            used = (hidden > 0).any(dim=-1).to(hidden)
+        asked = replace(request, ev=ev)
+        exposures.append(iterative_inpaint(painter, asked, settings.rounds, observer, depth_of=depth_of, used=used))
+    tell_spared(observer, rounds_evaluations(painter, settings.rounds) * (len(evs) - len(exposures)))
+    return tuple(exposures)
+
+
+def _matters(hidden: BallImage, known: BallImage, ball: Ball) -> bool:
+    """Whether what is hidden could be more than the share of the energy that may stay hidden.
+
+    Sums over the ball's pixels are energies: each covers the same solid angle.
+    """
+    disc = crop_ball(disc_mask(ball)[..., None], ball)
+    return float((hidden * disc).sum()) > HIDDEN_SHARE * float((known * disc).sum())
+
+
+def _clipped_share(balls: list[BallImage], evs: tuple[float, ...], merge: str, ball: Ball) -> float:
+    """Share of the ball where the merge would take from a further exposure."""
+    disc = crop_ball(disc_mask(ball)[..., None], ball)[..., 0]
+    hidden = hidden_radiance(balls, evs, evs[-1] - 1, merge)
+    return float(((hidden > 0).any(dim=-1) * disc).sum() / disc.sum())
+
+
+def bracket_remarks(probe: Probe) -> list[str]:
+    """What a report should say of a scene-sized bracket, one sentence each; nothing of a fixed one."""
+    if probe.settings.bracket == "fixed":
+        return []
+    remarks = [f"bracket sized to the scene: {len(probe.evs)} exposures, EV {', '.join(f'{ev:g}' for ev in probe.evs)}"]
+    if probe.clipped:
+        remarks.append(
+            f"EV {probe.evs[-1]:g} still clips on {probe.clipped:.2%} of the ball: lights there may be brighter than "
+            f"{2.0 ** -probe.evs[-1]:g}, where the map ends"
+        )
+    return remarks

@@ -1,5 +1,8 @@
 """Iterative inpainting: N balls, their median, and again from there.
 
+With a tolerance a round ends once its median is settled (`settling`), N being the most that it paints; balls that are
+not like the others (`outliers`) are left out of the median.
+
 Source: DiffusionLight, Algorithm 1 and Sec. 4.1.
 """
 
@@ -7,17 +10,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .ball import paint_depth, paste_ball
+from .ball import Ball, crop_ball, disc_mask, paint_depth, paste_ball
 from .errors import OptionError
 from .median import pixelwise_median, pixelwise_spread
-from .painter import Observer, Painter, PaintRequest, SilentObserver, check_schedule
-from .shapes import BallImage, Image
+from .outliers import find_outliers
+from .painter import Observer, Painter, PaintRequest, SilentObserver, check_schedule, steps_run
+from .settling import CONFIDENCE, error_bound, looks
+from .shapes import BallImage, Image, Mask
 
-__all__ = ["IterativeResult", "Rounds", "iterative_inpaint", "rounds_evaluations"]
+__all__ = [
+    "IterativeResult",
+    "Rounds",
+    "SparingObserver",
+    "Tally",
+    "iterative_inpaint",
+    "rounds_evaluations",
+    "rounds_steps",
+    "tally_lines",
+    "tell_spared",
+]
 
 
 @dataclass(frozen=True)
@@ -25,7 +42,7 @@ class Rounds:
     """The schedule of Algorithm 1.
 
     Attributes:
-        balls: N, balls in a median.
+        balls: N, balls in a median; the most, where there is a tolerance.
         rounds: k, medians taken. With 0 one ball is painted from noise and that is all (the paper's base model).
         strength: γ, share of the schedule that later rounds and the last ball run.
         steps: denoising steps of a full schedule.
@@ -33,6 +50,9 @@ class Rounds:
             the answer, at no more cost, but softer.
         until: share of the schedule after which the balls of a median stop (`painter.PaintRequest`); the last ball runs
             to the end. Without one the answer is a median of clean images predicted that early, softer still.
+        tolerance: error that a median may have, as `settling.error_bound` bounds it, in display values; a round ends
+            once its median is within. Without one every round paints N balls.
+        minimum: fewest balls of a round with a tolerance, N being the most in any case.
     """
 
     balls: int = 30
@@ -41,6 +61,8 @@ class Rounds:
     steps: int = 30
     final: bool = True
     until: float = 1.0
+    tolerance: float | None = None
+    minimum: int = 6
 
     def __post_init__(self) -> None:
         if not 1 <= self.balls <= 1000:
@@ -53,6 +75,44 @@ class Rounds:
             raise OptionError("steps", self.steps, "1 to 1000")
         if self.until != 1:
             check_schedule(self.steps, self.strength if self.rounds > 1 else 1.0, self.until)
+        if self.tolerance is not None and not 0 < self.tolerance < 1:
+            raise OptionError("tolerance", self.tolerance, "above 0, below 1, in display values; or none")
+        if not 3 <= self.minimum <= 1000:
+            raise OptionError("minimum", self.minimum, "3 to 1000 balls")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of balls after which a round's median is looked at; N alone without a tolerance."""
+        return (self.balls,) if self.tolerance is None else looks(self.minimum, self.balls)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What became of a round.
+
+    Attributes:
+        painted: balls painted.
+        left_out: seeds of those that are not in the median, being unlike the others; none without a tolerance.
+        error: bound on the median's error when the round ended, see `settling.error_bound`; None without a tolerance.
+    """
+
+    painted: int
+    left_out: tuple[int, ...] = ()
+    error: float | None = None
+
+
+@runtime_checkable
+class SparingObserver(Observer, Protocol):
+    """An observer that also hears of evaluations that were planned and are not needed."""
+
+    def spared(self, count: int) -> None:
+        """`count` denoiser evaluations of those planned will not be done."""
+
+
+def tell_spared(observer: Observer, count: int) -> None:
+    """Tell an observer of evaluations that are not needed, if it wants to hear."""
+    if count and isinstance(observer, SparingObserver):
+        observer.spared(count)
 
 
 @dataclass(frozen=True)
@@ -62,9 +122,10 @@ class IterativeResult:
     Attributes:
         ball: (1, D, D, 3) the answer, display-encoded.
         median: (1, D, D, 3) the last median it was painted from; the ball itself if no median was taken.
-        spread: (1, D, D, 3) median absolute deviation of the last round's balls.
-        balls: (N, D, D, 3) the last round's balls.
+        spread: (1, D, D, 3) median absolute deviation of the balls in the last median.
+        balls: (N, D, D, 3) the balls in the last median.
         evaluations: denoiser evaluations spent.
+        tallies: what became of each round.
         notes: what the painter had to say (`painter.PaintResult`), in order.
     """
 
@@ -74,6 +135,7 @@ class IterativeResult:
     balls: Float[Tensor, "n d d c"]
     evaluations: int
     notes: tuple[str, ...] = ()
+    tallies: tuple[Tally, ...] = ()
 
 
 def iterative_inpaint(
@@ -83,6 +145,7 @@ def iterative_inpaint(
     observer: Observer | None = None,
     *,
     depth_of: Callable[[Image], Image] | None = None,
+    used: Mask | None = None,
 ) -> IterativeResult:
     """Paint a ball by iterative inpainting (Algorithm 1).
 
@@ -90,11 +153,13 @@ def iterative_inpaint(
         painter: paints balls.
         request: canvas, depth, ball, EV and first seed; ball j of every round uses the first seed + j. Its strength
             and steps are replaced by those of `rounds`.
-        rounds: N, k, γ and steps.
+        rounds: N, k, γ and steps, and the tolerance if N is to depend on the balls.
         observer: hears of progress; may stop the run by raising.
         depth_of: depth of a canvas, (1, S, S, 3) -> (1, h, w, 1 or 3), near is bright. With it every median's composite
             gets a depth map of its own, as in the authors' code; without it all rounds use the request's, which the
             first round uses in any case.
+        used: (1, D, D) how much of each pixel the merge will use, 0 or more: where a tolerance is to be kept. All of
+            the disc alike when not given.
 
     Returns:
         The ball with the median, the spread and the cost. Each median is pasted on the original photograph, not on
@@ -102,8 +167,9 @@ def iterative_inpaint(
     """
     observer = observer or SilentObserver()
     seed = request.seeds[0]
-    seeds = tuple(seed + j for j in range(rounds.balls))
-    scene, spent, notes = request, list[int](), list[str]()
+    disc = _disc(request.ball)
+    weight = disc if used is None else disc * used[0]
+    scene, spent, notes, tallies = request, list[int](), list[str](), list[Tally]()
 
     def inpaint_balls(wanted: tuple[int, ...], strength: float, until: float = 1.0) -> BallImage:
         asked = replace(scene, seeds=wanted, strength=strength, steps=rounds.steps, until=until)
@@ -112,8 +178,30 @@ def iterative_inpaint(
         notes.extend(result.notes)
         return result.balls
 
+    def inpaint_round(i: int) -> BallImage:
+        """The balls that a median is taken of."""
+        strength = rounds.strength if i > 0 else 1.0
+        painted = list[BallImage]()
+        count = 0
+        for wanted in rounds.counts:
+            painted.append(inpaint_balls(tuple(range(seed + count, seed + wanted)), strength, rounds.until))
+            count, balls = wanted, torch.cat(painted)
+            observer.painted(request.ev, i, balls)
+            if rounds.tolerance is None:
+                tallies.append(Tally(count))
+                return balls
+            strange = find_outliers(balls, disc)
+            balls = balls[~strange]
+            error = error_bound(balls, weight, 1 - (1 - CONFIDENCE) / len(rounds.counts))
+            if error <= rounds.tolerance:
+                break
+        tallies.append(Tally(count, tuple(seed + j for j in strange.nonzero()[:, 0].tolist()), error))
+        tell_spared(observer, painter.evaluations(rounds.balls - count, rounds.steps, strength, rounds.until))
+        return balls
+
     def found(ball: BallImage, median: BallImage, balls: Float[Tensor, "n d d c"]) -> IterativeResult:
-        return IterativeResult(ball, median, pixelwise_spread(balls), balls, sum(spent), tuple(notes))
+        spread = pixelwise_spread(balls)
+        return IterativeResult(ball, median, spread, balls, sum(spent), tuple(notes), tuple(tallies))
 
     if rounds.rounds == 0:
         ball = inpaint_balls((seed,), 1.0)
@@ -121,12 +209,16 @@ def iterative_inpaint(
         return found(ball, ball, ball)
 
     for i in range(rounds.rounds):
-        balls = inpaint_balls(seeds, rounds.strength if i > 0 else 1.0, rounds.until)
+        balls = inpaint_round(i)
         median = pixelwise_median(balls)
-        observer.painted(request.ev, i, balls)
         scene = _with_median(request, median, depth_of)
     ball = inpaint_balls((seed,), rounds.strength) if rounds.final else median
     return found(ball, median, balls)
+
+
+def _disc(ball: Ball) -> Float[Tensor, "d d"]:
+    """1 where a pixel of the crop is the ball's, 0 outside."""
+    return crop_ball(disc_mask(ball)[..., None], ball)[0, ..., 0]
 
 
 def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[Image], Image] | None) -> PaintRequest:
@@ -137,10 +229,35 @@ def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[I
 
 
 def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:
-    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure, exactly."""
+    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure: exactly, with a tolerance at most."""
+    return _counted(painter.evaluations, rounds)
+
+
+def rounds_steps(rounds: Rounds) -> int:
+    """Denoising steps of all balls that `iterative_inpaint` will run at one exposure: with a tolerance at most."""
+    return _counted(lambda balls, steps, strength, until: balls * len(steps_run(steps, strength, until)), rounds)
+
+
+def _counted(cost: Callable[[int, int, float, float], int], rounds: Rounds) -> int:
     if rounds.rounds == 0:
-        return painter.evaluations(1, rounds.steps, 1.0)
-    first = painter.evaluations(rounds.balls, rounds.steps, 1.0, rounds.until)
-    again = painter.evaluations(rounds.balls, rounds.steps, rounds.strength, rounds.until) * (rounds.rounds - 1)
-    last = painter.evaluations(1, rounds.steps, rounds.strength) if rounds.final else 0
+        return cost(1, rounds.steps, 1.0, 1.0)
+    first = cost(rounds.balls, rounds.steps, 1.0, rounds.until)
+    again = cost(rounds.balls, rounds.steps, rounds.strength, rounds.until) * (rounds.rounds - 1)
+    last = cost(1, rounds.steps, rounds.strength, 1.0) if rounds.final else 0
     return first + again + last
+
+
+def tally_lines(result: IterativeResult, rounds: Rounds) -> list[str]:
+    """What a report should say of rounds with a tolerance, one sentence a round; nothing without one."""
+    lines = []
+    for number, tally in enumerate(result.tallies, 1):
+        if rounds.tolerance is None or tally.error is None:
+            continue
+        verdict = "settled" if tally.error <= rounds.tolerance else "not settled"
+        line = (
+            f"round {number}: {verdict} after {tally.painted} of at most {rounds.balls} balls, median within "
+            f"{tally.error:.3f} for a tolerance of {rounds.tolerance:g}"
+        )
+        seeds = ", ".join(map(str, tally.left_out))
+        lines.append(f"{line}; left out as unlike the others: seeds {seeds}" if seeds else line)
+    return lines

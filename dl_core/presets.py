@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from .errors import OptionError
-from .iterative import Rounds
+from .iterative import Rounds, rounds_steps
 
 __all__ = ["PRESETS", "Preset", "preset"]
 
@@ -33,11 +33,8 @@ class Preset:
 
     @property
     def guided_steps(self) -> int:
-        """Denoising steps over all exposures; each costs two denoiser evaluations with guidance."""
-        r = self.rounds
-        later = int(r.steps * r.strength)
-        each = r.steps if r.rounds == 0 else r.balls * (r.steps + later * (r.rounds - 1)) + later * r.final
-        return each * len(self.evs)
+        """Denoising steps over all balls and exposures; each costs two denoiser evaluations with guidance."""
+        return rounds_steps(self.rounds) * len(self.evs)
 
     def row(self, name: str) -> dict[str, Any]:
         """What a table says of it."""

@@ -8,11 +8,20 @@ import torch
 from comfy_api.latest import io
 
 from ..dl_core.ball import DEPTH_DISCS
+from ..dl_core.bracket import BRACKETS
 from ..dl_core.bracket_painter import BracketPainter
 from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ModelError
-from ..dl_core.estimate import Probe, Settings, check_photograph, estimate, planned_evaluations
-from ..dl_core.exposure import check_evs
+from ..dl_core.estimate import (
+    Probe,
+    Settings,
+    bracket_remarks,
+    check_photograph,
+    estimate,
+    planned_evaluations,
+    planned_evs,
+)
+from ..dl_core.iterative import Rounds
 from ..dl_core.presets import PRESETS
 from ..dl_core.prompts import NEGATIVE_PROMPT
 from .depth_ball import depth_input, given, place_inputs
@@ -38,6 +47,7 @@ from .painting import (
     rounds_of,
     sampling_inputs,
     seed_input,
+    settling_inputs,
 )
 from .progress import BarObserver
 from .sockets import CATEGORY, BallSocket, named_output, parse_evs
@@ -89,6 +99,15 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                     tooltip="What the depth map shows of the ball, as in Depth Ball Mask. by preset: authors with the "
                     "presets that reproduce their runs, paper and turbo, and ball with the others.",
                 ),
+                *settling_inputs(),
+                io.Combo.Input(
+                    "bracket",
+                    options=list(BRACKETS),
+                    default="fixed",
+                    optional=True,
+                    tooltip="fixed: every EV of evs. scene: EV 0, and the next darker one only while the last one "
+                    "clips; after the last of evs it goes on at the same distance down to ev_min.",
+                ),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -127,15 +146,20 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         depth: torch.Tensor | None = None,
         depth_model: DepthModel | None = None,
         depth_disc: str = BY_PRESET,
+        tolerance: float = 0.0,
+        min_balls: int = Rounds.minimum,
+        bracket: str = "fixed",
         **options: Any,
     ) -> io.NodeOutput:
         """Steer one painter to each exposure, and estimate."""
         photo = check_photograph(one_picture(image, "image"), "image")
-        schedule, values = rounds_of(preset, balls, rounds, strength, final, steps), check_evs(parse_evs(evs))
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls)
         disc = _preset_disc(preset) if depth_disc == BY_PRESET else depth_disc
-        settings = Settings(schedule, values, seed, merge, canvas, diameter, given(x), given(y), height, disc)
+        place = (canvas, diameter, given(x), given(y), height, disc)
+        settings = Settings(schedule, parse_evs(evs), seed, merge, *place, bracket=bracket, darkest=ev_min)
         observer = BarObserver()
-        painter = _bracket_painter(observer, clip, (prompt, dark_prompt, negative_prompt), values, ev_min, options)
+        prompts = (prompt, dark_prompt, negative_prompt)
+        painter = _bracket_painter(observer, clip, prompts, planned_evs(settings), ev_min, options)
         observer.expect(planned_evaluations(painter, settings))
         near = None if depth is None else one_picture(depth, "depth")
         probe = estimate(photo, painter, settings, depth=near, depth_of=depth_model, observer=observer)
@@ -181,10 +205,10 @@ def _bracket_painter(
 
 
 def _report(probe: Probe, seconds: dict[float, float]) -> str:
-    """What was run at each exposure, and how they were merged."""
+    """What was run at each exposure, which there were, and how they were merged."""
     settings = probe.settings
     lines = [
         exposure_lines(ev, settings.seed, settings.rounds, result, seconds[ev])
-        for ev, result in zip(settings.evs, probe.exposures, strict=True)
+        for ev, result in zip(probe.evs, probe.exposures, strict=True)
     ]
-    return "\n".join([*lines, merge_summary(settings.evs, settings.merge)])
+    return "\n".join([*lines, *bracket_remarks(probe), merge_summary(probe.evs, settings.merge)])

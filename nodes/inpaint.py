@@ -15,7 +15,7 @@ from comfy_api.latest import io
 from ..dl_core.ball import Ball, paste_ball, require_canvas
 from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ImageError
-from ..dl_core.iterative import iterative_inpaint, rounds_evaluations
+from ..dl_core.iterative import Rounds, iterative_inpaint, rounds_evaluations
 from ..dl_core.painter import PaintRequest
 from .doubts import doubts
 from .painter import ComfyPainter, Networks
@@ -32,6 +32,7 @@ from .painting import (
     rounds_of,
     sampling_inputs,
     seed_input,
+    settling_inputs,
 )
 from .progress import BarObserver
 from .sockets import CATEGORY, BallSocket, named_output
@@ -163,6 +164,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 *sampling_inputs(),
                 # Last, so that saved workflows keep the order of their widgets.
                 depth_model_input("Without one all rounds use depth."),
+                *settling_inputs(),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -190,10 +192,12 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         mask: torch.Tensor | None = None,
         ev: float = 0.0,
         depth_model: DepthModel | None = None,
+        tolerance: float = 0.0,
+        min_balls: int = Rounds.minimum,
         **options: Any,
     ) -> io.NodeOutput:
         """Run Algorithm 1."""
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls)
         request = _request(image, depth, ball, ev, (seed,))
         observer = BarObserver()
         painter = _painter(observer, ball, mask, options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, Final
 
 import torch
@@ -10,7 +10,7 @@ from comfy_api.latest import io
 
 from ..dl_core.errors import ImageError
 from ..dl_core.finished import FinishedBalls
-from ..dl_core.iterative import IterativeResult, Rounds
+from ..dl_core.iterative import IterativeResult, Rounds, tally_lines
 from ..dl_core.painter import IMPUTINGS
 from ..dl_core.presets import PRESETS, preset
 from ..dl_core.shapes import Image, Mask
@@ -33,6 +33,7 @@ __all__ = [
     "rounds_of",
     "sampling_inputs",
     "seed_input",
+    "settling_inputs",
 ]
 
 CUSTOM: Final = "custom"
@@ -112,6 +113,31 @@ def rounds_inputs(default: str) -> list[Any]:
     ]
 
 
+def settling_inputs() -> list[Any]:
+    """When a round ends before all balls are painted."""
+    return [
+        io.Float.Input(
+            "tolerance",
+            default=0.0,
+            min=0.0,
+            max=0.5,
+            step=0.005,
+            optional=True,
+            tooltip="Error that a median may have, in display values (0.02 is a good start): a round ends once its "
+            "median is within, and leaves out balls unlike the others; balls is the most it paints. "
+            "0 paints all of them.",
+        ),
+        io.Int.Input(
+            "min_balls",
+            default=Rounds.minimum,
+            min=3,
+            max=1000,
+            optional=True,
+            tooltip="With a tolerance, the fewest balls of a round; never more than balls.",
+        ),
+    ]
+
+
 def sampling_inputs() -> list[Any]:
     """How every node that paints samples."""
     return [
@@ -178,13 +204,23 @@ def depth_model_input(otherwise: str) -> Any:
 # --- from widgets to the library ---------------------------------------------------------------------------------
 
 
-def rounds_of(name: str, balls: int, rounds: int, strength: float, final: bool, steps: int) -> Rounds:
-    """The schedule of a preset, or of the node's own values.
+def rounds_of(
+    name: str,
+    balls: int,
+    rounds: int,
+    strength: float,
+    final: bool,
+    steps: int,
+    tolerance: float = 0.0,
+    min_balls: int = Rounds.minimum,
+) -> Rounds:
+    """The schedule of a preset, or of the node's own values; with a tolerance above 0, until medians are settled.
 
     Raises:
         OptionError: an option out of range.
     """
-    return Rounds(balls, rounds, strength, steps, final) if name == CUSTOM else preset(name).rounds
+    schedule = Rounds(balls, rounds, strength, steps, final) if name == CUSTOM else preset(name).rounds
+    return replace(schedule, tolerance=tolerance or None, minimum=min_balls)
 
 
 def guidance_of(options: dict[str, Any]) -> Guidance:
@@ -222,9 +258,10 @@ def comfy_painter(
 
 def exposure_lines(ev: float, seed: int, schedule: Rounds, result: IterativeResult, seconds: float) -> str:
     """What was run at an exposure, what it cost, how far its balls agree; one line, and one for each note."""
+    most = "" if schedule.tolerance is None else "up to "
     line = (
-        f"EV {ev:g}: {schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps, "
+        f"EV {ev:g}: {most}{schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps, "
         f"strength {schedule.strength:g}, seed {seed}; {result.evaluations} denoiser evaluations "
         f"in {seconds:.1f} s; mean spread {float(result.spread.mean()):.3f}"
     )
-    return "\n".join((line, *(f"EV {ev:g}: {note}" for note in result.notes)))
+    return "\n".join((line, *(f"EV {ev:g}: {note}" for note in (*result.notes, *tally_lines(result, schedule)))))

@@ -23,16 +23,22 @@ class BarObserver:
     def __init__(self) -> None:
         """Take the bar of the node that is running."""
         self._bar = comfy.utils.ProgressBar(1)
-        self._done = 0
+        self._done = self._total = 0
 
     def expect(self, evaluations: int) -> None:
         """Say how many denoiser evaluations fill the bar."""
+        self._total = evaluations
         self._bar.update_absolute(0, evaluations)
 
     def evaluated(self, count: int) -> None:
         """Move the bar."""
         self._done += count
         self._bar.update_absolute(self._done)
+
+    def spared(self, count: int) -> None:
+        """Bring the bar's end nearer (`dl_core.iterative.SparingObserver`)."""
+        self._total -= count
+        self._bar.update_absolute(self._done, self._total)
 
     def painted(self, ev: float, round_index: int, balls: BallImage) -> None:
         """Show the median of a finished round."""

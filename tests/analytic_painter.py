@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dl_core.ball import crop_ball
@@ -24,6 +25,9 @@ class Flaws:
     Attributes:
         noise: standard deviation of Gaussian noise on display values, drawn per seed.
         disco: share of seeds whose noise leads to a faceted ball, at every EV.
+        matte: share of seeds that lead to a ball that shows no detail finer than a third of it.
+        uneven: standard deviation of a smooth error on display values, drawn per seed, 3 x 3 and colours apart: light
+            that every ball imagines differently.
         stops: how much brighter than asked the exposures are painted, EVs below 0 only: they disagree with EV 0.
         drift: degrees by which the scene turns per EV step down: exposures that do not align.
         pull: how far SDEdit stays with the ball on the canvas: 0 forgets it, 1 returns it.
@@ -33,6 +37,8 @@ class Flaws:
 
     noise: float = 0.0
     disco: float = 0.0
+    matte: float = 0.0
+    uneven: float = 0.0
     stops: float = 0.0
     drift: float = 0.0
     pull: float = 0.5
@@ -80,10 +86,21 @@ class AnalyticPainter:
     def _draw(self, request: PaintRequest, seed: int) -> Tensor:
         generator = torch.Generator().manual_seed(seed)
         ball = self._true_ball(request.ball.diameter, self.flaws.drift * request.ev)
-        if float(torch.rand((), generator=generator)) < self.flaws.disco:
+        kind = float(torch.rand((), generator=generator))
+        if kind < self.flaws.disco:
             ball = _disco(ball, generator)
+        elif kind < self.flaws.disco + self.flaws.matte:
+            ball = _matte(ball)
         shown = expose(ball, request.ev + self.flaws.stops * (request.ev < 0))
-        return (shown + self.flaws.noise * torch.randn(shown.shape, generator=generator)).clamp(0, 1)
+        shown = shown + self.flaws.noise * torch.randn(shown.shape, generator=generator)
+        if self.flaws.uneven:
+            shown = shown + self.flaws.uneven * _smooth(ball.shape[1], generator)
+        return shown.clamp(0, 1)
+
+    def is_flawed(self, seed: int) -> bool:
+        """Whether a seed leads to a disco ball or a matte one."""
+        kind = float(torch.rand((), generator=torch.Generator().manual_seed(seed)))
+        return kind < self.flaws.disco + self.flaws.matte
 
     def _render(self, diameter: int, turn: float) -> Tensor:
         light = self.latlong_hdr if turn == 0 else rotate_latlong(self.latlong_hdr, camera_rotation(yaw=turn))
@@ -100,3 +117,16 @@ def _disco(ball: Tensor, generator: torch.Generator) -> Tensor:
     columns = (centres[None, :] + tilt[..., 1]).clamp(0, size - 1).long()
     cell = torch.arange(size) // facet
     return ball[:, rows[cell][:, cell], columns[cell][:, cell]]
+
+
+def _matte(ball: Tensor) -> Tensor:
+    """Every pixel shows the mean of its surroundings, a third of the ball wide."""
+    width = ball.shape[1] // 6 * 2 + 1
+    padded = F.pad(ball.permute(0, 3, 1, 2), [width // 2] * 4, mode="replicate")
+    return F.avg_pool2d(padded, width, stride=1).permute(0, 2, 3, 1)
+
+
+def _smooth(size: int, generator: torch.Generator) -> Tensor:
+    """(1, size, size, 3) of mean 0 and standard deviation near 1, without detail finer than half the ball."""
+    coarse = torch.randn(1, 3, 3, 3, generator=generator)
+    return F.interpolate(coarse, (size, size), mode="bicubic", align_corners=True).permute(0, 2, 3, 1)

@@ -13,7 +13,7 @@ from dl_core.ball import place_ball
 from dl_core.budget import Pace, best_within, calibrate, painted_balls
 from dl_core.errors import OptionError
 from dl_core.iterative import Rounds, iterative_inpaint
-from dl_core.painter import Observer, PaintRequest, PaintResult, first_step
+from dl_core.painter import Observer, PaintRequest, PaintResult, steps_run
 from dl_core.presets import Preset
 
 BALL = place_ball(64, 32)
@@ -30,8 +30,8 @@ class Timed:
     now: float = 0.0
     asked: list[PaintRequest] = field(default_factory=list)
 
-    def evaluations(self, balls: int, steps: int, strength: float) -> int:
-        return 2 * balls * (steps - first_step(steps, strength))
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
+        return 2 * balls * len(steps_run(steps, strength, until))
 
     def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
         count = len(request.seeds)

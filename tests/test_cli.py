@@ -236,6 +236,44 @@ def test_turbo_without_its_lora_is_remarked(
     assert "without a Turbo LoRA" not in capsys.readouterr().out
 
 
+def test_a_bracket_sized_to_the_scene(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A lamp of radiance 8 clips at EV 0 and not at EV -5, where 3 stops of it are left below white."""
+    backend()
+    assert run(photo, out, "--evs", "0,-2,-4,-6", "--bracket", "scene") == 0
+    printed = capsys.readouterr()
+    spent = EVALUATIONS  # three of the exposures: 8 is clipped at EV -2 too, and not at EV -4
+    assert "bracket sized to the scene: 3 exposures, EV 0, -2, -4\n" in printed.out
+    assert f"{spent}/{spent}" in printed.err  # the bar ended
+    header = OpenEXR.File(str(out / "a.exr"), header_only=True).header()
+    assert header["lightprobe:evs"] == "0, -2, -4"
+    assert run(photo, out, "--bracket", "scene", "--darkest", "-2.5", "--evs", "0,-1", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["evs"] == [0, -1, -2, -2.5]
+    assert report["clipped"] > 0
+    assert any("EV -2.5 still clips" in note for note in report["notes"])
+
+
+def test_a_tolerance_ends_rounds_sooner(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend(AnalyticPainter(sun_and_sky(), Flaws(noise=0.01, disco=0.2)))
+    options = ("--preset", "paper", "--tolerance", "0.02", "--min-balls", "8", "--evs", "0")
+    assert run(photo, out, *options, "--json") == 0
+    printed = capsys.readouterr()
+    report = json.loads(printed.out)
+    first, second = report["rounds"][0]
+    assert 8 <= first["painted"] < 30
+    assert first["error"] <= 0.02
+    spent = report["evaluations"]
+    assert spent == 2 * (30 * first["painted"] + 24 * second["painted"] + 24)
+    assert f"{spent}/{spent}" in printed.err
+    assert any(note.startswith("EV 0: round 1: settled after") for note in report["notes"])
+    header = OpenEXR.File(str(out / "a.exr"), header_only=True).header()
+    assert "N=8-30 tolerance=0.02 k=2" in header["lightprobe:method"]
+
+
 def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
     backend()
     assert run(photo, out, "--json") == 0
@@ -256,6 +294,11 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
         (["--evs", "0;-2"], "evs is '0;-2'; accepted: numbers and commas"),
         (["--evs", "0,nan"], "evs is"),
         (["--evs", ""], "evs is ''"),
+        (["--bracket", "auto"], "bracket is 'auto'; accepted: fixed, scene"),
+        (["--darkest", "-10"], "darkest is -10.0; accepted: nothing with a fixed bracket"),
+        (["--bracket", "scene", "--darkest", "0"], "darkest is 0.0; accepted: -40 up to"),
+        (["--tolerance", "0"], "tolerance is 0.0"),
+        (["--tolerance", "0.1", "--min-balls", "2"], "minimum is 2"),
         (["--merge", "mean"], "merge is 'mean'; accepted: robust, channel, paper"),
         (["--backend", "flux"], "backend is 'flux'; accepted: mini, diffusers"),
         (["--seed", "-1"], "seed is -1; accepted: 0 to 4294967295"),

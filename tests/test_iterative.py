@@ -15,7 +15,7 @@ from dl_core.bench.skies import SunAndSky
 from dl_core.errors import Interrupted, OptionError
 from dl_core.exposure import expose
 from dl_core.geometry import latlong_to_ball
-from dl_core.iterative import Rounds, iterative_inpaint, rounds_evaluations
+from dl_core.iterative import Rounds, Tally, iterative_inpaint, rounds_evaluations, tally_lines
 from dl_core.median import pixelwise_median
 from dl_core.painter import Observer, PaintRequest, PaintResult, SilentObserver, first_step
 from dl_core.presets import PRESETS, preset
@@ -176,6 +176,86 @@ def test_sdedit_starts_where_diffusers_does(steps: int, strength: float, first: 
     assert first_step(steps, strength) == first
 
 
+# --- rounds that end when their median is settled ------------------------------------------------------------------
+
+
+class Sparing:
+    """An observer that counts what is done and what is spared, and hears of balls so far."""
+
+    def __init__(self) -> None:
+        self.done = self.spared_in_all = 0
+        self.heard: list[int] = []
+
+    def evaluated(self, count: int) -> None:
+        self.done += count
+
+    def spared(self, count: int) -> None:
+        self.spared_in_all += count
+
+    def painted(self, ev: float, round_index: int, balls: torch.Tensor) -> None:
+        self.heard.append(len(balls))
+
+
+SETTLING = Rounds(balls=12, rounds=2, strength=0.5, steps=4, tolerance=0.05, minimum=4)
+
+
+def test_a_tolerance_asks_for_balls_a_few_at_a_time() -> None:
+    painter, observer = AnalyticPainter(LIGHT, Flaws(noise=0.02)), Sparing()
+    result = iterative_inpaint(painter, request(seed=7), SETTLING, observer)
+    assert [call.seeds for call in painter.requests] == [(7, 8, 9, 10), (7, 8, 9, 10), (7,)]
+    assert observer.heard == [4, 4]
+    assert [tally.painted for tally in result.tallies] == [4, 4]
+    assert result.evaluations == observer.done == painter.spent
+    assert observer.done + observer.spared_in_all == rounds_evaluations(painter, SETTLING)
+
+
+def test_a_tolerance_out_of_reach_paints_the_same_balls_as_none() -> None:
+    """None of them an outlier: the same seeds in the same order, and so the same medians to the bit."""
+    flaws, strict = Flaws(noise=0.02, uneven=0.05), replace(SETTLING, tolerance=1e-6)
+    painter, observer = AnalyticPainter(LIGHT, flaws), Sparing()
+    found = iterative_inpaint(painter, request(), strict, observer)
+    fixed = iterative_inpaint(AnalyticPainter(LIGHT, flaws), request(), replace(strict, tolerance=None))
+    assert observer.heard == [4, 5, 6, 7, 8, 10, 12] * 2
+    assert observer.spared_in_all == 0
+    assert [tally.left_out for tally in found.tallies] == [(), ()]
+    assert torch.equal(found.ball, fixed.ball)
+    assert torch.equal(found.balls, fixed.balls)
+    assert found.evaluations == fixed.evaluations
+
+
+def test_balls_left_out_are_named_by_their_seeds() -> None:
+    flaws = Flaws(noise=0.01, disco=0.25)
+    painter = AnalyticPainter(LIGHT, flaws)
+    rounds = Rounds(balls=12, rounds=1, steps=1, tolerance=1e-6, final=False)
+    result = iterative_inpaint(painter, request(seed=40), rounds)
+    flawed = [seed for seed in range(40, 52) if painter.is_flawed(seed)]
+    assert flawed
+    assert list(result.tallies[0].left_out) == flawed
+    assert rmse(result.median) < rmse(pixelwise_median(iterative_inpaint(painter, request(40), FIXED_12).balls))
+    (line,) = tally_lines(result, rounds)
+    assert "not settled after 12 of at most 12 balls" in line
+    assert line.endswith(f"seeds {', '.join(map(str, flawed))}")
+
+
+FIXED_12 = Rounds(balls=12, rounds=1, steps=1, final=False)
+
+
+def test_without_a_tolerance_rounds_are_told_of_and_nothing_is_left_out() -> None:
+    result = iterative_inpaint(
+        AnalyticPainter(LIGHT, Flaws(disco=0.3)), request(), replace(FIXED_12, rounds=2, steps=2)
+    )
+    assert result.tallies == (Tally(12), Tally(12))
+    assert tally_lines(result, FIXED_12) == []
+
+
+def test_only_what_the_merge_uses_is_waited_for() -> None:
+    """Nothing of the ball is used: the fewest balls do, however they differ."""
+    painter, nothing = AnalyticPainter(LIGHT, Flaws(uneven=0.2)), torch.zeros(1, 32, 32)
+    rounds = replace(SETTLING, rounds=1, tolerance=0.001)
+    assert iterative_inpaint(painter, request(), rounds, used=nothing).tallies[0].painted == 4
+    assert iterative_inpaint(painter, request(), rounds, used=nothing + 1).tallies[0].painted == 12
+
+
 # --- interruption ------------------------------------------------------------------------------------------------
 
 
@@ -238,6 +318,11 @@ def test_a_second_round_mends_what_the_first_left() -> None:
         ({"strength": 1.1}, "strength"),
         ({"strength": math.nan}, "strength"),
         ({"steps": 0}, "steps"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"tolerance": 1.0}, "tolerance"),
+        ({"tolerance": math.nan}, "tolerance"),
+        ({"minimum": 2}, "minimum"),
+        ({"minimum": 1001}, "minimum"),
     ],
 )
 def test_wrong_rounds_are_named(options: dict[str, float], name: str) -> None:

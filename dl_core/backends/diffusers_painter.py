@@ -344,6 +344,12 @@ class DiffusersPainter:
             self.pipeline.set_adapters(*turn)
             self._acting = turn
 
+    @property
+    def darkest_ev(self) -> float:
+        """EV of the dark prompt, the darkest it was trained on: see `bracket.ExposureLimited`. Below it `guidance_at`
+        goes on along the line of both prompts, past the dark one."""
+        return self.defaults.ev_min
+
     def guidance_at(self, ev: float) -> Guidance:
         """Embeddings at an EV, see `exposure_prompts`."""
         own, unwanted, own_pooled, unwanted_pooled = self._embed(self.defaults.prompt)

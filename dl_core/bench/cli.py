@@ -21,6 +21,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "steering": Subcommand("how well exposures follow the EV asked for", f"{__package__}.steering"),
     "pareto": Subcommand("error against cost over schedules, as a chart", f"{__package__}.pareto"),
     "early": Subcommand("what medians lose and save that stop denoising early", f"{__package__}.early"),
+    "bracket": Subcommand("what a scene-sized bracket keeps and costs", f"{__package__}.bracket"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
 }
 """The benches by name; a new one is a new row."""

@@ -19,6 +19,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--preset", default="balanced", help="draft, balanced, turbo or paper (default: balanced)")
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
     add("--evs", metavar="0,-2.5,-5", help="exposures, descending from 0 (default: the preset's)")
+    add(
+        "--bracket",
+        default="fixed",
+        help="fixed: every exposure; scene: the next darker one only while the last one clips, on to --darkest "
+        "(default: fixed)",
+    )
+    add(
+        "--darkest",
+        metavar="EV",
+        type=float,
+        help="with --bracket scene, where exposures end (default: what the model was trained to, -5; further down it "
+        "paints what it never saw)",
+    )
+    add(
+        "--tolerance",
+        type=float,
+        help="error a median may have, in display values, such as 0.02: a round ends once its median is within, and "
+        "leaves out balls unlike the others; the preset's balls are the most it paints (default: it paints them all)",
+    )
+    add("--min-balls", type=int, default=6, help="with --tolerance, the fewest balls of a round (default: 6)")
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
     add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
     add(

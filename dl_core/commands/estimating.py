@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,11 +18,13 @@ from tqdm import tqdm
 from .. import __version__
 from ..backends.loading import ModelFiles, choose_backend
 from ..ball import DEPTH_DISCS
+from ..bracket import check_bracket, ladder
 from ..depth import load_depth_model
 from ..errors import OptionError
-from ..estimate import Probe, Settings, estimate, planned_evaluations
+from ..estimate import Probe, Settings, bracket_remarks, estimate, planned_evaluations
 from ..exposure import check_evs, check_merge
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
+from ..iterative import Rounds, Tally, tally_lines
 from ..painter import IMPUTINGS, Painter, SilentObserver
 from ..presets import preset
 from ..shapes import Image
@@ -68,6 +71,11 @@ class _Progress(SilentObserver):
         """Move the bar."""
         self.bar.update(count)
 
+    def spared(self, count: int) -> None:
+        """Bring the bar's end nearer (`iterative.SparingObserver`)."""
+        self.bar.total -= count
+        self.bar.refresh()
+
 
 def run(args: argparse.Namespace) -> None:
     """Estimate, write, report. Everything that can be refused is refused before the model is loaded.
@@ -81,6 +89,12 @@ def run(args: argparse.Namespace) -> None:
     evs = chosen.evs if args.evs is None else _parse_evs(args.evs)
     backend = choose_backend(args.backend)
     check_merge(args.merge)
+    check_bracket(args.bracket)
+    if args.darkest is not None:
+        if args.bracket == "fixed":
+            raise OptionError("darkest", args.darkest, "nothing with a fixed bracket; or --bracket scene")
+        ladder(evs, args.darkest)  # refuses what no bracket ends at
+    rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls)
     if args.impute not in IMPUTINGS:
         raise OptionError("impute", args.impute, ", ".join(IMPUTINGS))
     if args.depth_disc is not None and args.depth_disc not in DEPTH_DISCS:
@@ -94,7 +108,7 @@ def run(args: argparse.Namespace) -> None:
     depth, depth_of = _depth(args.depth)
     loaded = backend.load(ModelFiles.of(args), args.impute)
     settings = Settings(
-        rounds=chosen.rounds,
+        rounds=rounds,
         evs=evs,
         seed=args.seed,
         merge=args.merge,
@@ -104,6 +118,8 @@ def run(args: argparse.Namespace) -> None:
         y=args.y,
         height=args.height,
         depth_disc=chosen.depth_disc if args.depth_disc is None else args.depth_disc,
+        bracket=args.bracket,
+        darkest=args.darkest,
     )
     painting = time.perf_counter()
     probe = _paint(photo, loaded.painter, settings, depth, depth_of)
@@ -144,20 +160,27 @@ def _paint(
 def probe_metadata(probe: Probe) -> dict[str, str]:
     """What a file should say about how its light was estimated: EXR string attributes by name."""
     settings, rounds = probe.settings, probe.settings.rounds
-    schedule = f"N={rounds.balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}"
     return {
         "lightprobe:software": f"ComfyUI-LightProbe {__version__}",
-        "lightprobe:method": f"DiffusionLight iterative inpainting, {schedule}, merge {settings.merge}",
-        "lightprobe:evs": ", ".join(f"{ev:g}" for ev in settings.evs),
+        "lightprobe:method": f"DiffusionLight iterative inpainting, {_schedule(rounds)}, merge {settings.merge}",
+        "lightprobe:evs": ", ".join(f"{ev:g}" for ev in probe.evs),
         "lightprobe:seed": str(settings.seed),
         "lightprobe:nfe": str(probe.evaluations),
         "lightprobe:axes": "centre -Z (where the camera looked), right of it +X, up +Y",
     }
 
 
+def _schedule(rounds: Rounds) -> str:
+    """A schedule in the letters of Algorithm 1."""
+    balls = f"N={rounds.balls}"
+    if rounds.tolerance is not None:
+        balls = f"N={rounds.counts[0]}-{rounds.balls} tolerance={rounds.tolerance:g}"
+    return f"{balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}"
+
+
 def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]:
     balls = [exposure.ball for exposure in probe.exposures]
-    sheet = sphere_sheet(probe.latlong_hdr, composite_ldr=probe.composite_ldr, balls_ldr=balls, evs=probe.settings.evs)
+    sheet = sphere_sheet(probe.latlong_hdr, composite_ldr=probe.composite_ldr, balls_ldr=balls, evs=probe.evs)
     write_map = _WRITERS[outputs.map.suffix.lower()]
     return [
         write_map(outputs.map, probe, probe_metadata(probe) | extra),
@@ -172,9 +195,10 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
         *_doubts(args),
         *(
             f"EV {ev:g}: {note}"
-            for ev, exposure in zip(probe.settings.evs, probe.exposures, strict=True)
-            for note in exposure.notes
+            for ev, exposure in zip(probe.evs, probe.exposures, strict=True)
+            for note in (*exposure.notes, *tally_lines(exposure, probe.settings.rounds))
         ),
+        *bracket_remarks(probe),
     ]
     if args.json:
         report = {
@@ -185,7 +209,9 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
             "preset": args.preset,
             "backend": args.backend,
             "merge": args.merge,
-            "evs": list(probe.settings.evs),
+            "evs": list(probe.evs),
+            "rounds": [[_tally(tally) for tally in exposure.tallies] for exposure in probe.exposures],
+            "clipped": probe.clipped,
             "seed": args.seed,
             "version": __version__,
             "notes": notes,
@@ -199,6 +225,12 @@ def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds
     peak = "" if memory is None else f", {memory / 2**30:.2f} GiB at the peak"
     took = f"{seconds['painting']:.1f} s, {seconds['total']:.1f} s in all"
     print(f"{probe.evaluations} denoiser evaluations in {took}{peak}")
+
+
+def _tally(tally: Tally) -> dict[str, Any]:
+    """As JSON has it, which knows no infinity."""
+    error = None if tally.error is None or math.isinf(tally.error) else tally.error
+    return {**asdict(tally), "error": error}
 
 
 def _doubts(args: argparse.Namespace) -> list[str]:

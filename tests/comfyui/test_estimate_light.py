@@ -224,6 +224,37 @@ def test_every_preset_is_on_offer(node: Nodes) -> None:
     assert combo.options == ["custom", *pack_module("dl_core.presets").PRESETS]
 
 
+@pytest.mark.parametrize("ev_min", [-5.0, -7.5])
+def test_a_bracket_sized_to_the_scene_takes_the_fixed_ones_balls(node: Nodes, graph: Any, ev_min: float) -> None:
+    """As many exposures of the ladder down to EV min as clip, each the very one of a fixed bracket."""
+    ladder = [0.0, -2.5, -5.0, -7.5][: int(-ev_min / 2.5) + 1]
+    fixed = whole(node, graph, evs=", ".join(map(str, ladder)), ev_min=ev_min)
+    with watched(graph) as counted:
+        sized = whole(node, graph, ev_min=ev_min, bracket="scene")
+    assert counted.count == 0
+    count = len(sized[3])
+    assert torch.equal(sized[3], fixed[3][:count])
+    clipped = [bool((ball**2.4 >= 0.9).any()) for ball in fixed[3]]
+    expected = next((i + 1 for i, clips in enumerate(clipped) if not clips), len(ladder))
+    assert count <= expected
+    assert f"bracket sized to the scene: {count} exposures" in sized[5]
+    if not clipped[0]:
+        assert torch.equal(sized[0], fixed[0])
+
+
+def test_progress_of_a_sized_bracket_ends(node: Nodes, graph: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import comfy.utils
+
+    calls: list[tuple[float, float]] = []
+    monkeypatch.setattr(
+        comfy.utils, "PROGRESS_BAR_HOOK", lambda value, total, preview, node_id=None: calls.append((value, total))
+    )
+    sized = whole(node, graph, bracket="scene")
+    assert calls[0] == (0, COST)
+    done = len(sized[3]) * COST // 3
+    assert calls[-1] == (done, done)
+
+
 def narrow_clip(graph: Any) -> Any:
     """Text encoders of another model."""
 
@@ -252,6 +283,9 @@ def narrow_clip(graph: Any) -> Any:
         ({"diameter": 65}, "OptionError", "^diameter is 65"),
         ({"canvas": 100}, "OptionError", "^canvas is 100"),
         ({"height": 1}, "OptionError", "^height is 1"),
+        ({"bracket": "long"}, "OptionError", "^bracket is 'long'; accepted: fixed, scene"),
+        ({"tolerance": 1.5}, "OptionError", "^tolerance is 1.5"),
+        ({"tolerance": 0.1, "min_balls": 1}, "OptionError", "^minimum is 1"),
         ({"merge": "guess"}, "OptionError", "^merge is 'guess'; accepted: robust, channel, paper"),
         ({"preset": "best"}, "OptionError", "^preset is 'best'; accepted: draft"),
         ({"balls": 0}, "OptionError", "^balls is 0"),

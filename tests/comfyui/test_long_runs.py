@@ -120,6 +120,57 @@ def test_more_balls_paint_only_the_ones_that_are_new(node: Nodes, graph: Any, sc
     assert torch.equal(more[1], run(node, graph, scene, balls=6, **rounds)[1])
 
 
+# --- rounds that end when their median is settled ------------------------------------------------------------------
+
+SETTLING = {"balls": 8, "min_balls": 4, "rounds": 1, "final": False}
+
+
+def test_balls_asked_for_a_few_at_a_time_are_found_again(node: Nodes, graph: Any, scene: Any) -> None:
+    """A tolerance out of reach asks for 4, 5, 6, 7, 8 balls; the interrupt falls into the sixth."""
+    import comfy.model_management as host
+
+    strict = {**SETTLING, "tolerance": 0.0001}
+    whole = run(node, graph, scene, **strict)
+    pack_module("nodes.painting").FINISHED.clear()
+
+    def stop(count: int, batch: int) -> None:
+        if count >= 5 * BALL_COST + 1:
+            host.interrupt_current_processing()
+
+    with watched(graph, stop), pytest.raises(host.InterruptProcessingException):
+        run(node, graph, scene, **strict)
+    with watched(graph) as counted:
+        resumed = run(node, graph, scene, **strict)
+    assert counted.count == 3 * BALL_COST
+    for ours, reference in zip(resumed[:4], whole[:4], strict=True):
+        assert torch.equal(ours, reference)
+    assert "EV 0: up to 8 balls, 1 rounds" in resumed[4]
+    assert "EV 0: 4 of 4 balls taken from an earlier run" in resumed[4]
+    assert "round 1: not settled after 8 of at most 8 balls" in resumed[4]
+    # And a run of so many balls without a tolerance has them all.
+    with watched(graph) as counted:
+        fixed = run(node, graph, scene, **{**SETTLING, "tolerance": 0.0})
+    assert counted.count == 0
+    if "left out" not in whole[4]:
+        assert torch.equal(fixed[1], whole[1])
+
+
+def test_progress_of_a_settled_run_fills_the_bar(
+    node: Nodes, graph: Any, scene: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import comfy.utils
+
+    calls: list[tuple[float, float]] = []
+    monkeypatch.setattr(
+        comfy.utils, "PROGRESS_BAR_HOOK", lambda value, total, preview, node_id=None: calls.append((value, total))
+    )
+    report = run(node, graph, scene, **{**SETTLING, "tolerance": 0.5})[4]
+    assert "round 1: settled after 4 of at most 8 balls" in report
+    assert calls[0] == (0, 8 * BALL_COST)
+    assert calls[-1] == (4 * BALL_COST, 4 * BALL_COST)
+    assert all(value <= total for value, total in calls)
+
+
 # --- memory ------------------------------------------------------------------------------------------------------
 
 

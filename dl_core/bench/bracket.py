@@ -1,0 +1,221 @@
+"""`lightprobe bench bracket`: what a scene-sized bracket keeps and costs, beside the fixed one and darker starts.
+
+Photographs are taken inside panoramas as in the paper's three spheres (Sec. 5.1), and maps estimated in several ways:
+
+- `fixed`: every exposure of the preset;
+- `scene`: EV 0, and darker ones while the last one clips, down to what the painter was made for;
+- `median G`: every exposure of the preset, the darker ones not from noise but by SDEdit with strength G from the next
+  brighter median, darkened in linear light.
+
+The last was tried for cost: it spares the share 1 - G of a darker exposure's steps. It is not on offer outside this
+bench; see `DarkenedPainter` for what was measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+from ..backends.loading import ModelFiles
+from ..ball import paste_ball
+from ..estimate import Settings, estimate
+from ..exposure import decode_display, encode_display
+from ..imageio import read_envmap
+from ..median import pixelwise_median
+from ..metrics import angular_error, energy_kept, irradiance, light_direction_error, si_rmse, spread_directions
+from ..painter import Observer, Painter, PaintRequest, PaintResult
+from ..presets import preset
+from ..shapes import BallImage
+from .cameras import CAMERAS, take
+from .journal import Journal
+from .painters import PAINTERS, Studio, add_files, identity, open_studio
+from .paintings import VARIANTS
+from .report import (
+    Column,
+    Report,
+    Row,
+    add_output,
+    add_panoramas,
+    panorama_files,
+    prepare_output,
+    publish,
+    summarize_groups,
+)
+
+__all__ = ["WAYS", "DarkenedPainter", "Way", "add_arguments", "bench_bracket", "run"]
+
+NORMALS: Final = 400
+STEERED: Final = "both"
+"""The row of the ablation whose exposures are steered."""
+
+
+@dataclass
+class DarkenedPainter:
+    """Paints darker exposures from the next brighter median instead of from noise.
+
+    That median times 2^(step in EV) in linear light, pasted in the photograph, is the canvas of SDEdit. What clips in
+    the brighter exposure is too dark in it, and left for the painter to brighten.
+
+    Attributes:
+        painter: paints.
+        strength: of SDEdit, above 0, below 1.
+    """
+
+    painter: Painter
+    strength: float
+    _medians: dict[float, BallImage] = field(default_factory=dict)
+
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
+        """See `painter.Painter`; of EV 0, the most."""
+        return self.painter.evaluations(balls, steps, strength, until)
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        """See `painter.Painter`; exposures are asked for from the brightest on."""
+        if request.ev == 0 and request.strength == 1:
+            self._medians.clear()
+        brighter = [ev for ev in self._medians if ev > request.ev]
+        if brighter and request.strength == 1:
+            nearest = min(brighter)
+            darkened = encode_display(decode_display(self._medians[nearest]) * 2.0 ** (request.ev - nearest))
+            canvas = paste_ball(request.canvas, darkened, request.ball)
+            request = replace(request, canvas=canvas, strength=self.strength)
+        result = self.painter.paint(request, observer)
+        self._medians[request.ev] = pixelwise_median(result.balls)
+        return result
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to estimate.
+
+    Attributes:
+        bracket: of `bracket.BRACKETS`.
+        around: what is put around the painter.
+    """
+
+    bracket: str = "fixed"
+    around: Callable[[Painter], Painter] = lambda painter: painter
+
+
+def _darkened(strength: float) -> Way:
+    return Way(around=lambda painter: DarkenedPainter(painter, strength))
+
+
+WAYS: Final[dict[str, Way]] = {
+    "fixed": Way(),
+    "scene": Way(bracket="scene"),
+    "median 0.9": _darkened(0.9),
+    "median 0.8": _darkened(0.8),
+    "median 0.6": _darkened(0.6),
+}
+
+_IDEALS: Final = {
+    "energy_kept": 1.0,
+    "irradiance_si_rmse": 0.0,
+    "irradiance_angular_error_deg": 0.0,
+    "light_direction_error_deg": 0.0,
+    "evaluations": 0.0,
+}
+_FIGURES: Final = (
+    Column("way", "way"),
+    Column("energy kept", "energy_kept", ".3f"),
+    Column("irradiance si-RMSE", "irradiance_si_rmse", ".3f"),
+    Column("irradiance angle (deg)", "irradiance_angular_error_deg", ".2f"),
+    Column("light (deg)", "light_direction_error_deg", ".1f"),
+    Column("evaluations", "evaluations", "g"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_panoramas(parser)
+    add = parser.add_argument
+    add("--painter", default="perfect", help=f"{', '.join(PAINTERS)} (default: perfect)")
+    add("--ways", nargs="+", choices=tuple(WAYS), default=["fixed", "scene"], help="ways (default: fixed scene)")
+    add("--preset", default="draft", help="schedule and bracket (default: draft)")
+    add("--seed", type=int, default=0, help="of the first ball (default: 0)")
+    add_files(parser)
+    add_output(parser)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure, write and print.
+
+    Raises:
+        ProbeError: a folder without maps, files of the painter that do not serve, or a report that cannot be written.
+    """
+    started = time.perf_counter()
+    files, chosen = panorama_files(args.panoramas), preset(args.preset)
+    prepare_output(args)
+    models = ModelFiles.of(args)
+    same = {
+        "bench": "bracket",
+        "panoramas": [path.stem for path in files],
+        "ways": args.ways,
+        "preset": args.preset,
+        "seed": args.seed,
+        "painter": identity(args.painter, models),
+    }
+    studio = open_studio(args.painter, models)
+    settings = Settings(chosen.rounds, chosen.evs, args.seed, canvas=studio.canvas, diameter=studio.diameter)
+    rows = bench_bracket(files, studio, settings, args.ways, journal=Journal(args.out, same, len(args.ways)))
+    report = Report(
+        "bracket",
+        {"painter": args.painter, "preset": args.preset, "camera": "three-spheres", "normals": NORMALS},
+        rows,
+        summarize_groups(rows, ("way",), _IDEALS),
+        time.perf_counter() - started,
+        seeds=(args.seed,),
+        evaluations=sum(row["evaluations"] for row in rows),
+    )
+    publish(report, args, rows=(Column("panorama", "panorama"), Column("EVs", "evs"), *_FIGURES), summary=_FIGURES)
+
+
+def bench_bracket(
+    panoramas: Sequence[Path],
+    studio: Studio,
+    settings: Settings,
+    ways: Sequence[str],
+    *,
+    journal: Journal | None = None,
+) -> list[Row]:
+    """Estimate every panorama's light in every way.
+
+    Args:
+        panoramas: files of linear radiance.
+        studio: gives the painters.
+        settings: schedule, bracket, seed and sizes.
+        ways: keys of `WAYS`.
+        journal: holds the panoramas that are measured already, and keeps the others.
+
+    Returns:
+        One row a panorama and way.
+    """
+    journal = journal or Journal(None, {}, len(ways))
+    for path in panoramas:
+        if path.stem not in journal.done:
+            journal.add([{"panorama": path.stem, **_measured(path, studio, settings, way)} for way in ways])
+    order = [path.stem for path in panoramas]
+    return sorted(journal.rows, key=lambda row: order.index(row["panorama"]))
+
+
+def _measured(path: Path, studio: Studio, settings: Settings, way: str) -> Row:
+    (camera,) = CAMERAS["three-spheres"](path.stem, settings.seed)
+    shot = take(read_envmap(path), camera)
+    painter = WAYS[way].around(studio.painter_of(VARIANTS[STEERED], shot))
+    probe = estimate(shot.photo_ldr, painter, replace(settings, bracket=WAYS[way].bracket))
+    normals = spread_directions(NORMALS)
+    lit, truth = irradiance(probe.latlong_hdr, normals), irradiance(shot.truth_hdr, normals)
+    return {
+        "way": way,
+        "evs": ",".join(f"{ev:g}" for ev in probe.evs),
+        "energy_kept": energy_kept(probe.latlong_hdr, shot.truth_hdr),
+        "irradiance_si_rmse": si_rmse(lit, truth),
+        "irradiance_angular_error_deg": angular_error(lit, truth),
+        "light_direction_error_deg": float(light_direction_error(probe.latlong_hdr, shot.truth_hdr)),
+        "evaluations": probe.evaluations,
+    }
