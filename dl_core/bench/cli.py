@@ -20,6 +20,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "metrics": Subcommand("score a picture against the true one", f"{__package__}.pairs"),
     "steering": Subcommand("how well exposures follow the EV asked for", f"{__package__}.steering"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
+    "lights": Subcommand("how small a light stands for a map, and how long it takes to find", f"{__package__}.lights"),
 }
 """The benches by name; a new one is a new row."""
 

@@ -73,11 +73,13 @@ class Decision:
         tolerance: relative error that was accepted.
         materials: of the spheres.
         candidates: by price, those of one price by error; the last is the map itself.
+        map_errors: of the chosen one as a map, `LightModel.radiance_map`, which cannot be negative.
     """
 
     tolerance: float
     materials: tuple[str, ...]
     candidates: tuple[Candidate, ...]
+    map_errors: dict[str, float]
 
     @property
     def chosen(self) -> Candidate:
@@ -85,8 +87,12 @@ class Decision:
         return self.cheapest(self.tolerance)
 
     def cheapest(self, tolerance: float) -> Candidate:
-        """The cheapest candidate within a tolerance, which is no smaller than those the decision was made for."""
-        return next(candidate for candidate in self.candidates if candidate.relative_error <= tolerance)
+        """The cheapest candidate within a tolerance, no smaller than the smallest the decision was made for."""
+        return _cheapest(self.candidates, tolerance)
+
+
+def _cheapest(candidates: Sequence[Candidate], tolerance: float) -> Candidate:
+    return next(candidate for candidate in candidates if candidate.relative_error <= tolerance)
 
 
 def choose_light(
@@ -127,7 +133,15 @@ def choose_light(
         lights = max(len(candidate.model.lights) for candidate in candidates if candidate.model)
         if enough <= _plain_price(lights + 1):
             break
-    return Decision(tolerance, names, tuple(sorted(found, key=lambda one: (one.parameters, one.relative_error))))
+    found.sort(key=lambda one: (one.parameters, one.relative_error))
+    return Decision(tolerance, names, tuple(found), _map_errors(_cheapest(found, tolerance), truth))
+
+
+def _map_errors(candidate: Candidate, truth: Spheres) -> dict[str, float]:
+    if candidate.model is None:
+        return candidate.errors
+    spheres = shade_map(candidate.model.radiance_map(ROWS), tuple(truth))
+    return {name: float(error) for name, error in errors_of(spheres, truth).items()}
 
 
 def extract_lights(latlong_hdr: Latlong, count: int, materials: Sequence[str] = tuple(MATERIALS)) -> LightModel:

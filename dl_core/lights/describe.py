@@ -23,7 +23,9 @@ _AXES: Final = "+X right of the photograph, +Y up, the camera looks along -Z"
 def describe(decision: Decision) -> dict[str, Any]:
     """What was chosen, at what price and error, and what else there was; numbers, text and lists alone.
 
-    Keys of light are `direction` (a unit vector), `irradiance` (RGB on a surface that faces it, radiance units x sr)
+    `map_errors` are those of the chosen light as a map, whose harmonics cannot be negative.
+
+    Keys of a light are `direction` (a unit vector), `irradiance` (RGB on a surface that faces it, radiance units x sr)
     and, of a light that is a disc, `angular_radius_deg`.
     """
     chosen = decision.chosen
@@ -31,6 +33,7 @@ def describe(decision: Decision) -> dict[str, Any]:
     return {
         **_summary(chosen),
         "errors": chosen.errors,
+        "map_errors": decision.map_errors,
         "tolerance": decision.tolerance,
         "materials": list(decision.materials),
         "axes": _AXES,
