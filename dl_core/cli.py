@@ -59,6 +59,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "queue": Command("run a workflow over photographs on ComfyUI servers and collect the maps", ".commands.queue"),
     "presets": Command("what each preset paints, costs and reaches", ".commands.presets"),
     "spheres": Command("show diffuse and mirror spheres under an environment map", ".commands.spheres"),
+    "lights": Command("find the smallest light that stands for an environment map", ".commands.lights"),
     "inspect": Command("print header, metadata and energy of an environment map", ".commands.inspect"),
     "bench": Command("measure stages of the method against the truth", ".bench.cli"),
     "train": Command("make training data and train the mini model or the exposure LoRA", ".training.cli"),

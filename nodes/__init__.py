@@ -13,6 +13,7 @@ from .estimate_light import EstimateLight
 from .exposure import EVPromptInterp, HDRMerge
 from .fit import FitBall
 from .inpaint import ChromeBallInpaint, IterativeMedian
+from .light_model import LightModel
 from .loaders import MiniProbeLoader
 from .photo_folder import LoadPhotoFolder
 from .speed_accuracy import SpeedAccuracyChart
@@ -33,6 +34,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     FitBall,
     BallToEquirect,
     EquirectToBall,
+    LightModel,
     EstimateLight,
     BallGrid,
     LoadPhotoFolder,

@@ -23,6 +23,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "early": Subcommand("what medians lose and save that stop denoising early", f"{__package__}.early"),
     "bracket": Subcommand("what a scene-sized bracket keeps and costs", f"{__package__}.bracket"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
+    "lights": Subcommand("how small a light stands for a map, and how long it takes to find", f"{__package__}.lights"),
 }
 """The benches by name; a new one is a new row."""
 

@@ -29,6 +29,7 @@ SOCKETS = {
     "FitBall": ("balls photograph ball", "fit report"),
     "BallToEquirect": ("image ball fit", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),
+    "LightModel": ("latlong", "latlong report picture"),
     "EstimateLight": (
         "model clip vae control_net image depth depth_model",
         "latlong hdr composite balls ball report",
