@@ -197,7 +197,7 @@ def bench_bracket(
     """
     journal = journal or Journal(None, {}, len(ways))
     for path in panoramas:
-        if path.stem not in journal.done:
+        if not journal.has(path.stem):
             journal.add([{"panorama": path.stem, **_measured(path, studio, settings, way)} for way in ways])
     order = [path.stem for path in panoramas]
     return sorted(journal.rows, key=lambda row: order.index(row["panorama"]))

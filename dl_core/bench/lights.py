@@ -97,7 +97,7 @@ def bench_lights(panoramas: Sequence[Path], *, journal: Journal | None = None) -
     """
     journal = journal or Journal(None, {}, len(SETS) * len(LEVELS))
     for path in panoramas:
-        if path.stem not in journal.done:
+        if not journal.has(path.stem):
             latlong = read_envmap(path)
             journal.add([row for name in SETS for row in _decide(path.stem, latlong, name)])
     return journal.rows
