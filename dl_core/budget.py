@@ -19,13 +19,13 @@ from .iterative import Rounds, rounds_evaluations
 from .painter import Painter, PaintRequest, SilentObserver
 from .presets import PRESETS, Preset
 
-__all__ = ["Pace", "best_within", "calibrate", "painted_balls"]
+__all__ = ["Choice", "Pace", "best_within", "calibrate", "check_budget", "choose", "painted_balls"]
 
 BALLS: Final = 4
 """Balls of the calibration: painters work on about so many at once."""
-FEW: Final = 1
-MORE: Final = 3
-"""Steps of its two paintings."""
+FEW: Final = 2
+MORE: Final = 4
+"""Steps of its two paintings; ComfyUI's uni_pc runs no fewer than two."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,28 @@ class Pace:
         exposures = len(preset.evs)
         evaluations = exposures * rounds_evaluations(painter, preset.rounds)
         return evaluations * self.evaluation + exposures * painted_balls(preset.rounds) * self.ball
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A preset that is ready in time.
+
+    Attributes:
+        name: of `presets.PRESETS`.
+        seconds: that painting it will take, at most.
+        calibration: seconds that finding out took.
+    """
+
+    name: str
+    seconds: float
+    calibration: float
+
+    def line(self, budget: float) -> str:
+        """What a report says of it."""
+        return (
+            f"budget {budget:g} s: preset {self.name}, {self.seconds:.1f} s of painting foretold after "
+            f"{self.calibration:.1f} s of calibration"
+        )
 
 
 def painted_balls(rounds: Rounds) -> int:
@@ -74,6 +96,44 @@ def calibrate(painter: Painter, canvas: int, diameter: int, clock: Callable[[], 
     (short, few), (long, more) = paint(FEW), paint(MORE)
     evaluation = max(0.0, long - short) / max(1, more - few)
     return Pace(evaluation, max(0.0, short - few * evaluation) / BALLS)
+
+
+def check_budget(seconds: float, option: str = "budget") -> None:
+    """Raise OptionError for a budget of 0 or less."""
+    if not seconds > 0:
+        raise OptionError(option, seconds, "seconds, above 0")
+
+
+def choose(
+    budget: float,
+    painter: Painter,
+    canvas: int,
+    diameter: int,
+    presets: Mapping[str, Preset] = PRESETS,
+    *,
+    option: str = "budget",
+    clock: Callable[[], float] = perf_counter,
+) -> Choice:
+    """The best preset whose painting is done within a budget, less the time that finding out takes.
+
+    Args:
+        budget: seconds.
+        painter: to paint with.
+        canvas: side of the canvas, pixels.
+        diameter: of the ball on it, pixels.
+        presets: to choose from.
+        option: what an error calls the budget.
+        clock: tells seconds.
+
+    Raises:
+        OptionError: a budget of 0 or less, or one that no preset fits in.
+    """
+    check_budget(budget, option)
+    started = clock()
+    pace = calibrate(painter, canvas, diameter, clock)
+    taken = clock() - started
+    name = best_within(budget - taken, painter, pace, presets, option)
+    return Choice(name, pace.seconds(painter, presets[name]), taken)
 
 
 def best_within(

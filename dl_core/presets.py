@@ -8,7 +8,7 @@ from typing import Any, Final
 from .errors import OptionError
 from .iterative import Rounds, rounds_steps
 
-__all__ = ["PRESETS", "Preset", "preset"]
+__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "preset"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,8 @@ class Preset:
             "summary": self.summary,
         }
 
+
+DEFAULT_PRESET: Final = "balanced"
 
 PAPER_EVS: Final = (0.0, -2.5, -5.0)
 

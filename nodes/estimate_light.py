@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -10,6 +11,7 @@ from comfy_api.latest import io
 from ..dl_core.ball import DEPTH_DISCS
 from ..dl_core.bracket import BRACKETS
 from ..dl_core.bracket_painter import BracketPainter
+from ..dl_core.budget import choose
 from ..dl_core.depth import DepthModel
 from ..dl_core.errors import ModelError
 from ..dl_core.estimate import (
@@ -21,8 +23,10 @@ from ..dl_core.estimate import (
     planned_evaluations,
     planned_evs,
 )
+from ..dl_core.exposure import check_evs
+from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import Rounds
-from ..dl_core.presets import PRESETS
+from ..dl_core.presets import PRESETS, Preset
 from ..dl_core.prompts import NEGATIVE_PROMPT
 from .depth_ball import depth_input, given, place_inputs
 from .doubts import doubts
@@ -36,6 +40,7 @@ from .exposure import (
 )
 from .painter import ComfyPainter, Networks
 from .painting import (
+    FINISHED,
     comfy_painter,
     depth_model_input,
     exposure_lines,
@@ -108,6 +113,16 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                     tooltip="fixed: every EV of evs. scene: EV 0, and the next darker one only while the last one "
                     "clips; after the last of evs it goes on at the same distance down to ev_min.",
                 ),
+                io.Float.Input(
+                    "budget",
+                    default=0.0,
+                    min=0.0,
+                    max=86400.0,
+                    step=1.0,
+                    optional=True,
+                    tooltip="Seconds for painting: above 0 the best preset that is done in time takes the place of "
+                    "the one above, by a short calibration that counts. 0: the preset above.",
+                ),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -149,23 +164,37 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         tolerance: float = 0.0,
         min_balls: int = Rounds.minimum,
         bracket: str = "fixed",
+        budget: float = 0.0,
         **options: Any,
     ) -> io.NodeOutput:
         """Steer one painter to each exposure, and estimate."""
         photo = check_photograph(one_picture(image, "image"), "image")
+        values, prompts = check_evs(parse_evs(evs)), (prompt, dark_prompt, negative_prompt)
+        told = []
+        if budget:
+            pace_of = _bracket_painter(BarObserver(), clip, prompts, (0.0,), ev_min, options, finished=None)
+            choice = choose(budget, pace_of, canvas, diameter, _presets(values, tolerance, min_balls))
+            preset, told = choice.name, [choice.line(budget)]
         schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls)
         disc = _preset_disc(preset) if depth_disc == BY_PRESET else depth_disc
         place = (canvas, diameter, given(x), given(y), height, disc)
-        settings = Settings(schedule, parse_evs(evs), seed, merge, *place, bracket=bracket, darkest=ev_min)
+        settings = Settings(schedule, values, seed, merge, *place, bracket=bracket, darkest=ev_min)
         observer = BarObserver()
-        prompts = (prompt, dark_prompt, negative_prompt)
         painter = _bracket_painter(observer, clip, prompts, planned_evs(settings), ev_min, options)
         observer.expect(planned_evaluations(painter, settings))
         near = None if depth is None else one_picture(depth, "depth")
         probe = estimate(photo, painter, settings, depth=near, depth_of=depth_model, observer=observer)
         found = torch.cat([exposure.ball for exposure in probe.exposures])
-        report = "\n".join([_report(probe, painter.seconds), *doubts(cls.hidden, preset, options["model"])])
+        report = "\n".join([*told, _report(probe, painter.seconds), *doubts(cls.hidden, preset, options["model"])])
         return io.NodeOutput(probe.latlong_hdr, probe.ball_hdr, probe.composite_ldr, found, probe.ball, report)
+
+
+def _presets(evs: tuple[float, ...], tolerance: float, min_balls: int) -> dict[str, Preset]:
+    """The presets as this node would run them."""
+    return {
+        name: replace(row, evs=evs, rounds=replace(row.rounds, tolerance=tolerance or None, minimum=min_balls))
+        for name, row in PRESETS.items()
+    }
 
 
 def _preset_disc(name: str) -> str:
@@ -180,6 +209,7 @@ def _bracket_painter(
     evs: tuple[float, ...],
     ev_min: float,
     options: dict[str, Any],
+    finished: FinishedBalls | None = FINISHED,
 ) -> BracketPainter:
     """A painter steered to each EV: both prompts are encoded once, and every EV lies between these originals.
 
@@ -192,7 +222,8 @@ def _bracket_painter(
     prompt, dark_prompt, negative_prompt = prompts
 
     def steered(positive: Any) -> ComfyPainter:
-        return comfy_painter(observer, Networks(positive=positive, negative=negative, **networks), guidance)
+        parts = Networks(positive=positive, negative=negative, **networks)
+        return comfy_painter(observer, parts, guidance, finished=finished)
 
     try:
         original, dark, negative = (encode_prompt(clip, text) for text in (prompt, dark_prompt, negative_prompt))

@@ -247,13 +247,17 @@ def one_picture(image: torch.Tensor, socket: str) -> Image:
 
 
 def comfy_painter(
-    observer: BarObserver, networks: Networks, guidance: Guidance, mask: Mask | None = None
+    observer: BarObserver,
+    networks: Networks,
+    guidance: Guidance,
+    mask: Mask | None = None,
+    finished: FinishedBalls | None = FINISHED,
 ) -> ComfyPainter:
     """A painter that shows its balls on the observer's bar, and finds those of earlier runs.
 
     Args, Raises: as `ComfyPainter`.
     """
-    return ComfyPainter(networks, guidance, mask=mask, on_balls=observer.preview, finished=FINISHED)
+    return ComfyPainter(networks, guidance, mask=mask, on_balls=observer.preview, finished=finished)
 
 
 def exposure_lines(ev: float, seed: int, schedule: Rounds, result: IterativeResult, seconds: float) -> str:

@@ -108,6 +108,42 @@ def run(photo: Path, out: Path, *options: str) -> int:
 # --- estimate ---
 
 
+def test_a_budget_chooses_the_preset(
+    backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backend()
+    argv = ["estimate", str(photo), "-o", str(out / "a.exr"), "--backend", "true", "--evs", "0", "--json"]
+    assert cli.main([*argv, "--budget", "3600"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    measured = {name: preset.error_deg for name, preset in PRESETS.items() if preset.error_deg is not None}
+    assert measured[report["preset"]] == min(measured.values())
+    assert report["evaluations"] == 2 * replace(PRESETS[report["preset"]], evs=(0.0,)).guided_steps
+    assert any(note.startswith(f"budget 3600 s: preset {report['preset']}") for note in report["notes"])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--budget", "0"], "budget is 0.0; accepted: seconds, above 0"),
+        (["--budget", "nan"], "budget is nan"),
+        (["--budget", "60", "--preset", "draft"], "nothing beside --preset"),
+        (["--budget", "1e-6"], "the cheapest preset, draft"),
+    ],
+)
+def test_a_budget_that_nothing_fits_in_is_refused(
+    backend: Callable[..., None],
+    photo: Path,
+    out: Path,
+    options: list[str],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    backend()
+    assert cli.main(["estimate", str(photo), "-o", str(out / "a.exr"), "--backend", "true", *options]) == 2
+    assert said in capsys.readouterr().err
+    assert names(out) == []
+
+
 def test_estimate_writes_a_probe_a_ball_and_a_sheet(
     backend: Callable[..., None], photo: Path, out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,7 +16,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("photo", metavar="PHOTO", help="photograph: JPEG, PNG, TIFF, WebP ...")
     add("-o", "--output", metavar="OUT.exr", required=True, help="map to write: .exr, or .hdr")
-    add("--preset", default="balanced", help="draft, balanced, turbo or paper (default: balanced)")
+    add("--preset", help="draft, balanced, turbo or paper (default: balanced)")
+    add(
+        "--budget",
+        type=float,
+        metavar="SECONDS",
+        help="in place of a preset: the best one whose painting is done in time, by a short calibration",
+    )
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
     add("--evs", metavar="0,-2.5,-5", help="exposures, descending from 0 (default: the preset's)")
     add(

@@ -16,9 +16,10 @@ import torch
 from tqdm import tqdm
 
 from .. import __version__
-from ..backends.loading import ModelFiles, choose_backend
+from ..backends.loading import LoadedPainter, ModelFiles, choose_backend
 from ..ball import DEPTH_DISCS
 from ..bracket import check_bracket, ladder
+from ..budget import check_budget, choose
 from ..depth import load_depth_model
 from ..errors import OptionError
 from ..estimate import Probe, Settings, bracket_remarks, estimate, planned_evaluations
@@ -26,7 +27,7 @@ from ..exposure import check_evs, check_merge
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
 from ..iterative import Rounds, Tally, tally_lines
 from ..painter import IMPUTINGS, Painter, SilentObserver
-from ..presets import preset
+from ..presets import DEFAULT_PRESET, PRESETS, Preset, preset
 from ..shapes import Image
 from ..spheres import sphere_sheet
 
@@ -85,8 +86,12 @@ def run(args: argparse.Namespace) -> None:
     """
     start = time.perf_counter()
     outputs = _Outputs.beside(args.output)
-    chosen = preset(args.preset)
-    evs = chosen.evs if args.evs is None else _parse_evs(args.evs)
+    if args.budget is not None:
+        check_budget(args.budget)
+        if args.preset is not None:
+            raise OptionError("budget", args.budget, "nothing beside --preset: it chooses one")
+    chosen = _preset(args, args.preset or DEFAULT_PRESET)
+    evs = chosen.evs
     backend = choose_backend(args.backend)
     check_merge(args.merge)
     check_bracket(args.bracket)
@@ -94,7 +99,6 @@ def run(args: argparse.Namespace) -> None:
         if args.bracket == "fixed":
             raise OptionError("darkest", args.darkest, "nothing with a fixed bracket; or --bracket scene")
         ladder(evs, args.darkest)  # refuses what no bracket ends at
-    rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls)
     if args.impute not in IMPUTINGS:
         raise OptionError("impute", args.impute, ", ".join(IMPUTINGS))
     if args.depth_disc is not None and args.depth_disc not in DEPTH_DISCS:
@@ -107,9 +111,11 @@ def run(args: argparse.Namespace) -> None:
     photo = read_photograph(args.photo)
     depth, depth_of = _depth(args.depth)
     loaded = backend.load(ModelFiles.of(args), args.impute)
+    args.preset, told = _choose(args, loaded)
+    chosen = _preset(args, args.preset)
     settings = Settings(
-        rounds=rounds,
-        evs=evs,
+        rounds=chosen.rounds,
+        evs=chosen.evs,
         seed=args.seed,
         merge=args.merge,
         canvas=loaded.canvas,
@@ -125,7 +131,23 @@ def run(args: argparse.Namespace) -> None:
     probe = _paint(photo, loaded.painter, settings, depth, depth_of)
     painted = time.perf_counter()
     written = _write(outputs, probe, {"lightprobe:preset": args.preset, "lightprobe:backend": args.backend})
-    _report(args, probe, written, {"total": time.perf_counter() - start, "painting": painted - painting})
+    _report(args, probe, written, told, {"total": time.perf_counter() - start, "painting": painted - painting})
+
+
+def _preset(args: argparse.Namespace, name: str) -> Preset:
+    """A preset with what the command line replaces of it."""
+    chosen = preset(name)
+    rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls)
+    return replace(chosen, rounds=rounds, evs=chosen.evs if args.evs is None else _parse_evs(args.evs))
+
+
+def _choose(args: argparse.Namespace, loaded: LoadedPainter) -> tuple[str, list[str]]:
+    """The preset asked for, or the best one in the time budget, and what to say of it."""
+    if args.budget is None:
+        return args.preset or DEFAULT_PRESET, []
+    presets = {name: _preset(args, name) for name in PRESETS}
+    choice = choose(args.budget, loaded.painter, loaded.canvas, args.diameter or loaded.diameter, presets)
+    return choice.name, [choice.line(args.budget)]
 
 
 def _depth(name: str | None) -> tuple[Image | None, Callable[[Image], Image] | None]:
@@ -189,9 +211,12 @@ def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]
     ]
 
 
-def _report(args: argparse.Namespace, probe: Probe, written: list[Path], seconds: dict[str, float]) -> None:
+def _report(
+    args: argparse.Namespace, probe: Probe, written: list[Path], told: list[str], seconds: dict[str, float]
+) -> None:
     memory = _peak_memory()
     notes = [
+        *told,
         *_doubts(args),
         *(
             f"EV {ev:g}: {note}"

@@ -255,9 +255,7 @@ class _Taken:
         order = torch.stack(list(alone.values())).amax(0).argsort(descending=True).tolist()
         # The last row is the whole; each row above it does without one more radius, the most missed last.
         none = {name: torch.zeros_like(sphere) for name, sphere in whole.items()}
-        steps = {
-            name: torch.cat((none[name], missed[name][order[::-1]].cumsum(0))).flip(0) for name in self.names
-        }
+        steps = {name: torch.cat((none[name], missed[name][order[::-1]].cumsum(0))).flip(0) for name in self.names}
         models = [
             LightModel(self.coefficients, tuple(self._light(index, order[:count]) for index in range(len(order))))
             for count in range(len(order) + 1)

@@ -224,6 +224,24 @@ def test_every_preset_is_on_offer(node: Nodes) -> None:
     assert combo.options == ["custom", *pack_module("dl_core.presets").PRESETS]
 
 
+def test_a_budget_replaces_the_preset_and_leaves_nothing_behind(
+    node: Nodes, graph: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    presets = pack_module("dl_core.presets").PRESETS
+    draft = replace(presets["draft"], error_deg=3.0)
+    dear = replace(presets["paper"], error_deg=2.0, rounds=replace(presets["paper"].rounds, balls=1000, steps=998))
+    monkeypatch.setattr(pack_module("nodes.estimate_light"), "PRESETS", {"draft": draft, "paper": dear})
+    forget()
+    whole(node, graph, preset="draft", cfg=1.0)
+    kept = pack_module("nodes.painting").FINISHED.bytes_held
+    report = whole(node, graph, budget=600.0, cfg=1.0)[5]
+    assert report.startswith("budget 600 s: preset draft, ")
+    assert report.count(f"{draft.rounds.balls} balls, {draft.rounds.rounds} rounds") == 3
+    assert pack_module("nodes.painting").FINISHED.bytes_held == kept
+    with pytest.raises(pack_module("dl_core.errors").OptionError, match="budget.*cheapest preset, draft"):
+        whole(node, graph, budget=1e-6, cfg=1.0)
+
+
 @pytest.mark.parametrize("ev_min", [-5.0, -7.5])
 def test_a_bracket_sized_to_the_scene_takes_the_fixed_ones_balls(node: Nodes, graph: Any, ev_min: float) -> None:
     """As many exposures of the ladder down to EV min as clip, each the very one of a fixed bracket."""
