@@ -40,7 +40,9 @@ class LightModel(io.ComfyNode):  # type: ignore[misc]
                     tooltip="Accepted difference of the worst sphere: its RMS relative to the RMS under the full map.",
                 ),
                 *(
-                    io.Boolean.Input(name, default=name == "diffuse", tooltip=f"Whether the {name} sphere has to match.")
+                    io.Boolean.Input(
+                        name, default=name == "diffuse", tooltip=f"Whether the {name} sphere has to match."
+                    )
                     for name in MATERIALS
                 ),
             ],

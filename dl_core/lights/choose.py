@@ -172,7 +172,7 @@ def _plain_price(lights: int) -> int:
     return CHANNELS * (BAND + 1) ** 2 + lights * Light((0.0, 1.0, 0.0), (1.0, 1.0, 1.0)).parameters
 
 
-def _reduced(latlong_hdr: Latlong) -> Latlong:
+def _reduced(latlong_hdr: Latlong) -> Float[Tensor, "b rows columns c"]:
     require_latlong(latlong_hdr)
     if latlong_hdr.shape[0] != 1:
         raise ImageError("latlong", f"holds {latlong_hdr.shape[0]} maps; one is accepted")
@@ -255,9 +255,7 @@ class _Taken:
         order = torch.stack(list(alone.values())).amax(0).argsort(descending=True).tolist()
         # The last row is the whole; each row above it does without one more radius, the most missed last.
         none = {name: torch.zeros_like(sphere) for name, sphere in whole.items()}
-        steps = {
-            name: torch.cat((none[name], missed[name][order[::-1]].cumsum(0))).flip(0) for name in self.names
-        }
+        steps = {name: torch.cat((none[name], missed[name][order[::-1]].cumsum(0))).flip(0) for name in self.names}
         models = [
             LightModel(self.coefficients, tuple(self._light(index, order[:count]) for index in range(len(order))))
             for count in range(len(order) + 1)

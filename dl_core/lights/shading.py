@@ -54,8 +54,8 @@ BAND: Final = 2
 COSINE_LOBE: Final = (math.pi, 2 * math.pi / 3, math.pi / 4)
 """Irradiance of each band for a radiance of 1: the cosine lobe's coefficients (Ramamoorthi and Hanrahan 2001, Eq. 8)."""
 
-Spheres = dict[str, Float[Tensor, "*n pixels c"]]
-"""Radiance of the pixels a sphere covers, by material."""
+Spheres = dict[str, Float[Tensor, "..."]]
+"""Radiance of the pixels a sphere covers, (n, pixels, channels) by material; materials differ in their pixels."""
 
 _CHROME: Final = Surface(base=1.0, metallic=True, roughness=0.0)
 
@@ -152,9 +152,7 @@ def shade_map(latlong_hdr: Latlong, materials: Sequence[str], size: int | None =
     return {name: _render(name, latlong_hdr, _size(name, size)) for name in materials}
 
 
-def shade_harmonics(
-    coefficients: Float[Tensor, "n k 3"], materials: Sequence[str], size: int | None = None
-) -> Spheres:
+def shade_harmonics(coefficients: Float[Tensor, "n k 3"], materials: Sequence[str], size: int | None = None) -> Spheres:
     """Spheres under harmonics of band 0 to 2, signed: (n, pixels, 3) by material."""
     count = coefficients.shape[1]
     return {
@@ -163,9 +161,7 @@ def shade_harmonics(
     }
 
 
-def shade_lights(
-    lights: Sequence[Light], materials: Sequence[str], size: int | None = None
-) -> Spheres:
+def shade_lights(lights: Sequence[Light], materials: Sequence[str], size: int | None = None) -> Spheres:
     """Spheres under lights, each alone: (n, pixels, 3) by material."""
     radii = torch.tensor([math.radians(light.angular_radius or 0.0) for light in lights])
     maps = disc_maps(torch.tensor([light.direction for light in lights]), radii, ROWS)
