@@ -368,7 +368,7 @@ def test_harmonics_are_rendered_once_for_all_maps(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("tolerance", [0.0, -0.1, 1.0, math.nan, math.inf])
 def test_tolerances_are_checked(tolerance: float) -> None:
-    with pytest.raises(OptionError, match="tolerance is .*above 0, below 1"):
+    with pytest.raises(OptionError, match=r"tolerance is .*above 0, below 1"):
         choose_light(band_map(0), tolerance)
 
 

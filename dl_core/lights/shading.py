@@ -52,7 +52,7 @@ ROWS: Final = 128
 BAND: Final = 2
 """Highest band of a model's harmonics."""
 COSINE_LOBE: Final = (math.pi, 2 * math.pi / 3, math.pi / 4)
-"""Irradiance of each band for a radiance of 1: the cosine lobe's coefficients (Ramamoorthi and Hanrahan 2001, Eq. 8)."""
+"""Irradiance of each band for a radiance of 1: the cosine lobe (Ramamoorthi and Hanrahan 2001, Eq. 8)."""
 
 Spheres = dict[str, Float[Tensor, "..."]]
 """Radiance of the pixels a sphere covers, (n, pixels, channels) by material; materials differ in their pixels."""
