@@ -172,7 +172,7 @@ def _plain_price(lights: int) -> int:
     return CHANNELS * (BAND + 1) ** 2 + lights * Light((0.0, 1.0, 0.0), (1.0, 1.0, 1.0)).parameters
 
 
-def _reduced(latlong_hdr: Latlong) -> Latlong:
+def _reduced(latlong_hdr: Latlong) -> Float[Tensor, "b rows columns c"]:
     require_latlong(latlong_hdr)
     if latlong_hdr.shape[0] != 1:
         raise ImageError("latlong", f"holds {latlong_hdr.shape[0]} maps; one is accepted")

@@ -41,8 +41,10 @@ _NEAR, _FAR = 8.0, 24.0
 """Radii in degrees of the caps that compete for the most light: for lamps and suns, and for windows and glare."""
 _SEARCH_ROWS: Final = 32
 _RECENTRINGS: Final = 6
+_SPARE: Final = 1.1
 _MARGIN: Final = 1.5
-"""Rows by which a cap is wider than its light's disc at least: pixels that the disc's edge crosses are in it."""
+"""Factor and rows by which a cap is wider than its light's disc at least: a disc that is cut off measures less than it
+is, and pixels that its edge crosses belong to it."""
 _WIDENINGS: Final = 6
 """Times that a cap is widened because its light's disc is not all in it, and by what factor at least."""
 _STEP: Final = 1.3
@@ -168,7 +170,7 @@ def _extract(world: _Map, axis: Float[Tensor, "3"], radius: float) -> Extraction
     for _ in range(_WIDENINGS):
         if found is None:
             return None
-        whole = math.radians(found.light.angular_radius or 0.0) + _MARGIN * world.grid.row
+        whole = _SPARE * math.radians(found.light.angular_radius or 0.0) + _MARGIN * world.grid.row
         if whole <= radius:
             break
         radius = max(whole, _STEP * radius)

@@ -52,10 +52,10 @@ ROWS: Final = 128
 BAND: Final = 2
 """Highest band of a model's harmonics."""
 COSINE_LOBE: Final = (math.pi, 2 * math.pi / 3, math.pi / 4)
-"""Irradiance of each band for a radiance of 1: the cosine lobe's coefficients (Ramamoorthi and Hanrahan 2001, Eq. 8)."""
+"""Irradiance of each band for a radiance of 1: the cosine lobe (Ramamoorthi and Hanrahan 2001, Eq. 8)."""
 
-Spheres = dict[str, Float[Tensor, "*n pixels c"]]
-"""Radiance of the pixels a sphere covers, by material."""
+Spheres = dict[str, Float[Tensor, "..."]]
+"""Radiance of the pixels a sphere covers, (n, pixels, channels) by material; materials differ in their pixels."""
 
 _CHROME: Final = Surface(base=1.0, metallic=True, roughness=0.0)
 
