@@ -128,7 +128,7 @@ def test_a_grid_holds_the_presets_and_the_papers_own_points_once(name: str) -> N
     names = [schedule.name for schedule in schedules]
     assert len(set(names)) == len(names)
     assert set(PRESETS) <= set(names)
-    runs = [(schedule.preset.rounds, schedule.preset.evs) for schedule in schedules]
+    runs = [tuple(schedule.settings.values()) for schedule in schedules]
     assert len(set(runs)) == len(runs)
     papers = {(s.preset.rounds.balls, s.preset.rounds.rounds) for s in schedules if "paper" in (s.kind, s.name)}
     assert papers == {(balls, rounds) for balls in (5, 15, 30) for rounds in (1, 2)}
@@ -202,6 +202,37 @@ def test_a_schedule_that_changed_does_not_stand_beside_its_old_figures(
     assert "a new folder: mid was" in capsys.readouterr().err
     assert (tmp_path / "out" / "rows.jsonl").read_text() == before
     assert main([*options, "--seed", "5"]) == 1
+
+
+def test_a_painter_is_varied_where_it_can_be_and_left_out_where_not(
+    maps: Path, few: dict[str, Schedule], capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    class Louder(AnalyticPainter):
+        def varied(self, *, sampler: str | None, guidance: float | None) -> AnalyticPainter:
+            return Louder(self.latlong_hdr, Flaws(noise=guidance or 0.0))
+
+    guided = replace(few["mid"], name="guided", guidance=0.4)
+    monkeypatch.setitem(GRIDS, "small", lambda: [few["mid"], guided])
+    options = ("--panoramas", str(maps), "--painter", "noisy")
+    assert [row["schedule"] for row in report_of(capsys, *options)["rows"]] == ["mid"]
+    able = Studio(lambda variant, shot: Louder(shot.truth_hdr), CANVAS, DIAMETER)
+    monkeypatch.setitem(PAINTERS, "noisy", lambda files: able)
+    rows = {row["schedule"]: row for row in report_of(capsys, *options)["rows"]}
+    assert rows["guided"]["guidance"] == 0.4
+    assert rows["guided"]["angular_error_deg"] > 2 * rows["mid"]["angular_error_deg"]
+
+
+def test_a_scene_sized_bracket_is_charted_at_what_it_spent(
+    maps: Path, few: dict[str, Schedule], capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    dim = torch.full((64, 128, 3), 0.2)
+    for name in ("one", "two"):
+        write_exr(maps / f"{name}.exr", dim, metadata={})
+    sized = replace(few["mid"], name="sized", bracket="scene")
+    monkeypatch.setitem(GRIDS, "small", lambda: [few["mid"], sized])
+    monkeypatch.setitem(PAINTERS, "noisy", lambda files: studio(Flaws()))
+    rows = {row["schedule"]: row for row in report_of(capsys, "--panoramas", str(maps), "--painter", "noisy")["rows"]}
+    assert rows["sized"]["nfe"] == rows["mid"]["nfe"] / 2
 
 
 def test_one_panorama_has_no_interval_and_says_so(

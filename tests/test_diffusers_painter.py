@@ -353,3 +353,17 @@ def test_the_photograph_and_a_composite_are_encoded_once(
     assert len(encoded) == 3
     painter.paint(others[0], SilentObserver())
     assert len(encoded) == 4
+
+
+def test_a_varied_painter_samples_and_guides_in_another_way(painter: DiffusersPainter, request_: PaintRequest) -> None:
+    short = replace(request_, seeds=(1,), steps=3)
+    own = painter.paint(short, SilentObserver())
+    unguided = painter.varied(guidance=1.0).paint(short, SilentObserver())
+    assert unguided.evaluations * 2 == own.evaluations
+    euler = painter.varied(sampler="euler").paint(short, SilentObserver())
+    direct = DiffusersPainter(painter.pipeline, painter.defaults, sampler="euler").paint(short, SilentObserver())
+    assert torch.equal(euler.balls, direct.balls)
+    for other in (unguided, euler):
+        assert (other.balls - own.balls).abs().max() > 1e-3
+    with pytest.raises(OptionError, match="sampler"):
+        painter.varied(sampler="none")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -116,6 +116,17 @@ class DiffusersPainter:
         self._acting: tuple[str, float] | None = None
         self._embeddings: dict[str, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
         self._encoded: list[tuple[Image, Any]] = []
+
+    def varied(self, *, sampler: str | None = None, guidance: float | None = None) -> DiffusersPainter:
+        """The same networks with another sampler or scale of guidance."""
+        return DiffusersPainter(
+            self.pipeline,
+            self.defaults if guidance is None else replace(self.defaults, guidance=guidance),
+            sampler=sampler or self.sampler,
+            batch=self._batches.size,
+            impute=self.impute,
+            lora_swap=self.lora_swap,
+        )
 
     @staticmethod
     def from_mini(model: MiniModel, **options: Any) -> DiffusersPainter:

@@ -17,11 +17,13 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from typing import Final
 
 from ..backends.loading import ModelFiles
+from ..bracket import darkest_of
 from ..errors import ImageError, OptionError
 from ..estimate import Settings, estimate
 from ..imageio import read_envmap
@@ -179,10 +181,16 @@ def bench_pareto(
         if not wanted:
             continue
         shot = take(read_envmap(path), Camera())
-        painter = SharedBalls(studio.painter_of(STEERED, shot))
+        own = studio.painter_of(STEERED, shot)
+        painters: dict[tuple[str | None, float | None], SharedBalls] = {}
+        base = Settings(seed=seed, canvas=studio.canvas, diameter=studio.diameter, darkest=darkest_of(own))
         for schedule in wanted:
-            base = Settings(seed=seed, canvas=studio.canvas, diameter=studio.diameter)
-            settings = STEERED.settings(schedule.preset, base)
+            varied = schedule.painter(own)
+            if varied is None:
+                report(f"{path.stem} {schedule.name}: left out, this painter has no sampler or guidance to change")
+                continue
+            painter = painters.setdefault((schedule.sampler, schedule.guidance), SharedBalls(varied))
+            settings = replace(STEERED.settings(schedule.preset, base), bracket=schedule.bracket)
             head = {"panorama": path.stem, "schedule": schedule.name, "settings": _told(schedule)}
             journal.add([{**head, **_measure(shot, painter, settings, convention)}])
             report(f"{path.stem} {schedule.name}: {journal.rows[-1]['nfe']} evaluations")

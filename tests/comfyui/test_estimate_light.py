@@ -238,7 +238,7 @@ def test_a_budget_replaces_the_preset_and_leaves_nothing_behind(
     assert report.startswith("budget 600 s: preset draft, ")
     assert report.count(f"{draft.rounds.balls} balls, {draft.rounds.rounds} rounds") == 3
     assert pack_module("nodes.painting").FINISHED.bytes_held == kept
-    with pytest.raises(pack_module("dl_core.errors").OptionError, match="budget.*cheapest preset, draft"):
+    with pytest.raises(pack_module("dl_core.errors").OptionError, match=r"budget.*cheapest preset, draft"):
         whole(node, graph, budget=1e-6, cfg=1.0)
 
 
