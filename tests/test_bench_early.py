@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from dl_core.backends.loading import ModelFiles
+from dl_core.bench.early_decoding import DecodingSection
 from dl_core.bench.early_latents import LatentsSection, latent_median
 from dl_core.bench.early_noise import NoiseSection, rank_correlation, ranks
-from dl_core.bench.early_section import Options, Scene, ball_rmse
+from dl_core.bench.early_section import Options, Scene, Section, ball_rmse
 from dl_core.bench.early_until import UntilSection
 from dl_core.bench.painters import PAINTERS, Studio, open_studio
 from dl_core.bench.perfect import PerfectPainter
@@ -122,9 +123,20 @@ def test_medians_of_a_single_ball_are_that_ball_both_ways(panoramas: list[Path])
     assert 0 < row["saved"] < row["saved_early"] < 1
 
 
-def test_a_painter_without_latents_is_refused(panoramas: list[Path]) -> None:
+@pytest.mark.parametrize("section", [LatentsSection, DecodingSection])
+def test_a_painter_without_latents_is_refused(panoramas: list[Path], section: type[Section]) -> None:
     with pytest.raises(OptionError, match="a painter on diffusers"):
-        LatentsSection(studio(PerfectPainter), OPTIONS).measure(panoramas[0])
+        section(studio(PerfectPainter), OPTIONS).measure(panoramas[0])
+
+
+def test_the_margin_in_use_loses_less_than_half_a_code(panoramas: list[Path]) -> None:
+    section = DecodingSection(open_studio("mini", ModelFiles()), OPTIONS)
+    rows = section.measure(panoramas[0])
+    worst = [row["worst_codes"] for row in rows]
+    assert [row["margin"] for row in rows if row["in_use"]] == [4]
+    assert worst == sorted(worst, reverse=True)
+    assert worst[2] < 0.5 < 1 < worst[0]
+    assert section.each == len(rows) == len(section.summarize(rows))
 
 
 # --- noise -------------------------------------------------------------------------------------------------------
@@ -192,6 +204,6 @@ def test_the_command_prints_and_goes_on(
     again = json.loads(capsys.readouterr().out)
     assert (again["rows"], again["summary"]) == (first["rows"], first["summary"])
     assert main([*command, "--section", "none"]) == 2
-    assert "--section is 'none'; accepted: until, latents, noise" in capsys.readouterr().err
+    assert "--section is 'none'; accepted: until, latents, decoding, noise" in capsys.readouterr().err
     assert main([*command, "--steps", "2", "--untils", "0.3"]) == 2
     assert "until is 0.3; accepted: at least 0.5 with 2 steps" in capsys.readouterr().err

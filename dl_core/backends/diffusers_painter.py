@@ -384,13 +384,14 @@ class DiffusersPainter:
     @torch.no_grad()
     def decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
         """Balls cut out of painted latents, (n, 4, h, w) -> (n, D, D, 3) in [0, 1]."""
+        return decode_ball(self.decode, latents, ball, decode_margin(self.pipeline.vae)).cpu().contiguous()
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Image:
+        """Latents of any size as pictures, (n, 4, h, w) -> (n, 8 h, 8 w, 3) display-encoded, not clipped."""
         vae = self.pipeline.vae
-
-        def decode(part: Tensor) -> Image:
-            pixels = vae.decode(part.to(vae.dtype) / vae.config.scaling_factor).sample
-            return (pixels.float() / 2 + 0.5).permute(0, 2, 3, 1)
-
-        return decode_ball(decode, latents, ball, decode_margin(vae)).cpu().contiguous()
+        pixels = vae.decode(latents.to(vae.dtype) / vae.config.scaling_factor).sample
+        return (pixels.float() / 2 + 0.5).permute(0, 2, 3, 1)
 
     @property
     def _device(self) -> torch.device:

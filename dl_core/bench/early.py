@@ -13,6 +13,7 @@ from typing import Final
 from ..backends.loading import ModelFiles
 from ..errors import OptionError
 from ..iterative import Rounds
+from .early_decoding import DecodingSection
 from .early_latents import LatentsSection
 from .early_noise import NoiseSection
 from .early_section import Options, Section
@@ -23,7 +24,12 @@ from .report import Report, add_output, add_panoramas, panorama_files, prepare_o
 
 __all__ = ["SECTIONS", "add_arguments", "run"]
 
-SECTIONS: Final[dict[str, type[Section]]] = {"until": UntilSection, "latents": LatentsSection, "noise": NoiseSection}
+SECTIONS: Final[dict[str, type[Section]]] = {
+    "until": UntilSection,
+    "latents": LatentsSection,
+    "decoding": DecodingSection,
+    "noise": NoiseSection,
+}
 """What can be measured, by name."""
 
 

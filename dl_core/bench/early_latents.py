@@ -17,11 +17,10 @@ from torch import Tensor
 
 from ..backends.diffusers_painter import DiffusersPainter, ball_latent_mask
 from ..ball import Ball, paste_ball
-from ..errors import OptionError
 from ..median import pixelwise_median
 from ..painter import PaintRequest
 from ..shapes import BallImage
-from .early_section import Scene, Section, ball_rmse
+from .early_section import Scene, Section, ball_rmse, latents_of, require_latents
 from .paintings import VARIANTS
 from .report import Column, Row
 
@@ -78,9 +77,7 @@ class LatentsSection(Section):
             OptionError: a painter without latents.
         """
         scene, options = Scene.of(path, self._studio), self._options
-        painter = self._studio.painter_of(VARIANTS["both"], scene.shot)
-        if not isinstance(painter, DiffusersPainter):
-            raise OptionError("--painter", type(painter).__name__, "a painter on diffusers for the section latents")
+        painter = require_latents(self._studio.painter_of(VARIANTS["both"], scene.shot))
         ball, seconds, spent = scene.request.ball, dict[str, float](), list[int]()
 
         def timed(what: str, work: Callable[[], Tensor]) -> Tensor:
@@ -95,7 +92,7 @@ class LatentsSection(Section):
         latents = timed("denoising", lambda: painter.inpaint(asked, photograph, spent.append))
         balls = timed("decoding", lambda: painter.decode_ball(latents, ball))
         canvas = timed("pixels", lambda: paste_ball(asked.canvas, pixelwise_median(balls), ball))
-        known = timed("encoding", lambda: _latents_of(painter, canvas))
+        known = timed("encoding", lambda: latents_of(painter, canvas))
         middle = timed("latents", lambda: latent_median(latents))
 
         again = replace(asked, seeds=seeds[:1], strength=options.strength)
@@ -103,7 +100,7 @@ class LatentsSection(Section):
         other = _sdedit(painter, replace(again, seeds=(seeds[0] + options.balls,)), known, spent.append)
         truth, medians = scene.true_ball(0.0), (pixelwise_median(balls), painter.decode_ball(middle, ball))
         saved = seconds["decoding"] + seconds["pixels"] + seconds["encoding"] - seconds["latents"]
-        there_and_back = _latents_of(painter, paste_ball(asked.canvas, medians[1], ball))
+        there_and_back = latents_of(painter, paste_ball(asked.canvas, medians[1], ball))
         early = min(options.untils)
         return [
             {
@@ -157,10 +154,3 @@ def _differ(one: Tensor, other: Tensor, ball: Ball) -> float:
     inside = ball_latent_mask(replace(ball, dilation=0)).to(other) == 1
     first, second = (latents[inside.expand_as(latents)].view(latents.shape[1], -1) for latents in (one, other))
     return float((first - second).norm() / (second - second.mean(dim=1, keepdim=True)).norm())
-
-
-def _latents_of(painter: DiffusersPainter, canvas: Tensor) -> Tensor:
-    """Clean latents of a canvas as the denoiser has them; the mode, where the autoencoder has one."""
-    encoded = painter.encode(canvas)
-    latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents
-    return latents.float() * painter.pipeline.vae.config.scaling_factor

@@ -7,17 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from torch import Tensor
+
+from ..backends.diffusers_painter import DiffusersPainter
 from ..ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, place_ball
+from ..errors import OptionError
 from ..exposure import expose
 from ..geometry import latlong_to_ball
 from ..imageio import read_envmap
-from ..painter import PaintRequest
-from ..shapes import BallImage
+from ..painter import Painter, PaintRequest
+from ..shapes import BallImage, Image
 from .cameras import Camera, Shot, take
 from .painters import Studio
 from .report import Column, Row
 
-__all__ = ["Options", "Scene", "Section", "ball_rmse"]
+__all__ = ["Options", "Scene", "Section", "ball_rmse", "latents_of", "require_latents"]
 
 
 @dataclass(frozen=True)
@@ -107,3 +111,21 @@ def ball_rmse(one: BallImage, other: BallImage) -> float:
     ball = Ball(0, 0, diameter, diameter, 0)
     inside = crop_ball(disc_mask(ball)[..., None], ball)
     return float((((one - other) ** 2 * inside).sum() / (3 * inside.sum())).sqrt())
+
+
+def require_latents(painter: Painter) -> DiffusersPainter:
+    """A painter whose latents can be reached.
+
+    Raises:
+        OptionError: another one.
+    """
+    if not isinstance(painter, DiffusersPainter):
+        raise OptionError("--painter", type(painter).__name__, "a painter on diffusers for this section")
+    return painter
+
+
+def latents_of(painter: DiffusersPainter, canvas: Image) -> Tensor:
+    """Clean latents of a canvas as the denoiser has them; the mode, where the autoencoder has one."""
+    encoded = painter.encode(canvas)
+    latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents
+    return latents.float() * painter.pipeline.vae.config.scaling_factor
