@@ -26,6 +26,7 @@ __all__ = [
     "Ball",
     "Frame",
     "crop_ball",
+    "crop_disc",
     "disc_mask",
     "fit_canvas",
     "paint_depth",
@@ -256,6 +257,11 @@ def crop_ball(image: Image, ball: Ball) -> BallImage:
     return image[:, ball.top : ball.top + ball.diameter, ball.left : ball.left + ball.diameter]
 
 
+def crop_disc(ball: Ball) -> Float[Tensor, "d d"]:
+    """The ball's disc in its crop: (diameter, diameter), 1 where a pixel's centre lies on the ball, 0 outside."""
+    return crop_ball(disc_mask(ball)[..., None], ball)[0, ..., 0]
+
+
 def paste_ball(image: Image, crop: Float[Tensor, "n d d c"], ball: Ball) -> Image:
     """Paste a ball crop on canvas images through the hard disc (paper, Algorithm 1, line 12).
 
@@ -267,7 +273,7 @@ def paste_ball(image: Image, crop: Float[Tensor, "n d d c"], ball: Ball) -> Imag
     Returns:
         A new (B, canvas, canvas, C); the input is left as it was.
     """
-    disc = crop_ball(disc_mask(ball)[..., None], ball).to(image)
+    disc = crop_disc(ball)[None, ..., None].to(image)
     result = image.clone()
     window = crop_ball(result, ball)
     window.copy_(window * (1 - disc) + crop.to(image) * disc)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, paste_ball, place_ball
+from .ball import Ball, crop_disc, fit_canvas, paint_depth, paste_ball, place_ball
 from .bracket import check_bracket, darkest_of, hidden_radiance, ladder
 from .errors import ImageError, OptionError
 from .exposure import check_evs, check_merge, merge_bracket
@@ -235,13 +235,13 @@ def _matters(hidden: BallImage, known: BallImage, ball: Ball) -> bool:
 
     Sums over the ball's pixels are energies: each covers the same solid angle.
     """
-    disc = crop_ball(disc_mask(ball)[..., None], ball)
+    disc = crop_disc(ball)[None, ..., None]
     return float((hidden * disc).sum()) > HIDDEN_SHARE * float((known * disc).sum())
 
 
 def _clipped_share(balls: list[BallImage], evs: tuple[float, ...], merge: str, ball: Ball) -> float:
     """Share of the ball where the merge would take from a further exposure."""
-    disc = crop_ball(disc_mask(ball)[..., None], ball)[..., 0]
+    disc = crop_disc(ball)[None]
     hidden = hidden_radiance(balls, evs, evs[-1] - 1, merge)
     return float(((hidden > 0).any(dim=-1) * disc).sum() / disc.sum())
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .ball import Ball, crop_ball, disc_mask, paint_depth, paste_ball
+from .ball import crop_disc, paint_depth, paste_ball
 from .errors import OptionError
 from .median import pixelwise_median, pixelwise_spread
 from .outliers import find_outliers
@@ -167,8 +167,6 @@ def iterative_inpaint(
     """
     observer = observer or SilentObserver()
     seed = request.seeds[0]
-    disc = _disc(request.ball)
-    weight = disc if used is None else disc * used[0]
     scene, spent, notes, tallies = request, list[int](), list[str](), list[Tally]()
 
     def inpaint_balls(wanted: tuple[int, ...], strength: float, until: float = 1.0) -> BallImage:
@@ -179,24 +177,19 @@ def iterative_inpaint(
         return result.balls
 
     def inpaint_round(i: int) -> BallImage:
-        """The balls that a median is taken of."""
+        """The balls that the median of a round is taken of."""
         strength = rounds.strength if i > 0 else 1.0
-        painted = list[BallImage]()
-        count = 0
-        for wanted in rounds.counts:
-            painted.append(inpaint_balls(tuple(range(seed + count, seed + wanted)), strength, rounds.until))
-            count, balls = wanted, torch.cat(painted)
+
+        def paint(wanted: range) -> BallImage:
+            return inpaint_balls(tuple(wanted), strength, rounds.until)
+
+        def heard(balls: BallImage) -> None:
             observer.painted(request.ev, i, balls)
-            if rounds.tolerance is None:
-                tallies.append(Tally(count))
-                return balls
-            strange = find_outliers(balls, disc)
-            balls = balls[~strange]
-            error = error_bound(balls, weight, 1 - (1 - CONFIDENCE) / len(rounds.counts))
-            if error <= rounds.tolerance:
-                break
-        tallies.append(Tally(count, tuple(seed + j for j in strange.nonzero()[:, 0].tolist()), error))
-        tell_spared(observer, painter.evaluations(rounds.balls - count, rounds.steps, strength, rounds.until))
+
+        balls, tally = _settle(paint, heard, seed, rounds, crop_disc(request.ball), used)
+        tallies.append(tally)
+        unpainted = rounds.balls - tally.painted
+        tell_spared(observer, painter.evaluations(unpainted, rounds.steps, strength, rounds.until))
         return balls
 
     def found(ball: BallImage, median: BallImage, balls: Float[Tensor, "n d d c"]) -> IterativeResult:
@@ -216,9 +209,42 @@ def iterative_inpaint(
     return found(ball, median, balls)
 
 
-def _disc(ball: Ball) -> Float[Tensor, "d d"]:
-    """1 where a pixel of the crop is the ball's, 0 outside."""
-    return crop_ball(disc_mask(ball)[..., None], ball)[0, ..., 0]
+def _settle(
+    paint: Callable[[range], BallImage],
+    heard: Callable[[BallImage], None],
+    seed: int,
+    rounds: Rounds,
+    disc: Float[Tensor, "d d"],
+    used: Mask | None,
+) -> tuple[Float[Tensor, "n d d c"], Tally]:
+    """Paint the balls of a round until their median is settled, or all of them.
+
+    Args:
+        paint: paints the balls of seeds.
+        heard: hears of all balls so far.
+        seed: of the first ball.
+        rounds: numbers of balls and the tolerance.
+        disc: (D, D) where the ball is.
+        used: as `iterative_inpaint` takes it.
+
+    Returns:
+        The balls of the median, and what became of the round.
+    """
+    painted, count = list[Tensor](), 0
+    for wanted in rounds.counts:
+        painted.append(paint(range(seed + count, seed + wanted)))
+        balls, count = torch.cat(painted), wanted
+        heard(balls)
+        if rounds.tolerance is None:
+            continue
+        strange = find_outliers(balls, disc)
+        kept = balls[~strange]
+        weight = disc if used is None else disc * used[0].to(disc)
+        error = error_bound(kept, weight, 1 - (1 - CONFIDENCE) / len(rounds.counts))
+        if error <= rounds.tolerance or wanted == rounds.balls:
+            left_out = tuple(seed + j for j in strange.nonzero()[:, 0].tolist())
+            return kept, Tally(count, left_out, error)
+    return balls, Tally(count)
 
 
 def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[Image], Image] | None) -> PaintRequest:

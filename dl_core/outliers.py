@@ -45,7 +45,7 @@ def find_outliers(balls: BallImage, weight: Float[Tensor, "d d"]) -> Bool[Tensor
     """
     count = len(balls)
     if count < 4:
-        return torch.zeros(count, dtype=torch.bool)
+        return torch.zeros(count, dtype=torch.bool, device=balls.device)
     scores = torch.maximum(_strangeness(balls, weight), _detail_difference(balls, weight))
     most = (count - 1) // 2
     cut = max(LIMIT, float(scores.sort(descending=True).values[most]))

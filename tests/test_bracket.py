@@ -15,7 +15,7 @@ from test_iterative import Sparing
 from tolerances import assert_close
 
 import dl_core
-from dl_core.ball import crop_ball, disc_mask
+from dl_core.ball import crop_disc
 from dl_core.bench.cameras import Camera, take
 from dl_core.bench.perfect import PerfectPainter
 from dl_core.bench.skies import SunAndSky, sun_direction
@@ -154,7 +154,7 @@ def test_no_exposure_too_many_and_none_too_few(elevation: float, azimuth: float,
     painter = PerfectPainter(light)
     sized = estimate(GREY, painter, settings)
     full = estimate(GREY, painter, replace(settings, bracket="fixed", evs=planned_evs(settings, painter)))
-    disc = crop_ball(disc_mask(sized.ball)[..., None], sized.ball)
+    disc = crop_disc(sized.ball)[..., None]
     kept, whole = (float((probe.ball_hdr * disc).sum()) for probe in (sized, full))
     assert whole / 1.01 <= kept <= whole * (1 + 1e-5)
     true = latlong_to_ball(light, 32)

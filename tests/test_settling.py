@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from tolerances import assert_close
 
-from dl_core.ball import crop_ball, disc_mask, paint_depth, place_ball
+from dl_core.ball import crop_disc, paint_depth, place_ball
 from dl_core.bench.skies import SunAndSky
 from dl_core.errors import OptionError
 from dl_core.exposure import expose
@@ -28,7 +28,7 @@ from dl_core.settling import CONFIDENCE, error_bound, f_quantile, looks, low_pas
 
 SIDE = 32
 BALL = place_ball(64, SIDE)
-DISC = crop_ball(disc_mask(BALL)[..., None], BALL)[0, ..., 0]
+DISC = crop_disc(BALL)
 LIGHT = SunAndSky(sun_radius=10.0).latlong(32)
 TRUTH = expose(latlong_to_ball(LIGHT, SIDE, samples=4), 0.0)
 

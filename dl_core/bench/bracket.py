@@ -14,22 +14,27 @@ bench; see `DarkenedPainter` for what was measured.
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
+from jaxtyping import Float
+from torch import Tensor
+
 from ..backends.loading import ModelFiles
-from ..ball import paste_ball
-from ..estimate import Settings, estimate
-from ..exposure import decode_display, encode_display
+from ..ball import crop_disc, paste_ball
+from ..estimate import Probe, Settings, estimate
+from ..exposure import decode_display, encode_display, expose, luminance
+from ..geometry import latlong_to_ball
 from ..imageio import read_envmap
 from ..median import pixelwise_median
 from ..metrics import angular_error, energy_kept, irradiance, light_direction_error, si_rmse, spread_directions
 from ..painter import Observer, Painter, PaintRequest, PaintResult
 from ..presets import preset
-from ..shapes import BallImage
+from ..shapes import BallImage, Latlong
 from .cameras import CAMERAS, take
 from .journal import Journal
 from .painters import PAINTERS, Studio, add_files, identity, open_studio
@@ -118,6 +123,8 @@ _IDEALS: Final = {
     "irradiance_si_rmse": 0.0,
     "irradiance_angular_error_deg": 0.0,
     "light_direction_error_deg": 0.0,
+    "darker_rmse": 0.0,
+    "highlight_stops": 0.0,
     "evaluations": 0.0,
 }
 _FIGURES: Final = (
@@ -126,6 +133,8 @@ _FIGURES: Final = (
     Column("irradiance si-RMSE", "irradiance_si_rmse", ".3f"),
     Column("irradiance angle (deg)", "irradiance_angular_error_deg", ".2f"),
     Column("light (deg)", "light_direction_error_deg", ".1f"),
+    Column("darker RMSE", "darker_rmse", ".4f"),
+    Column("highlights (stops)", "highlight_stops", ".2f"),
     Column("evaluations", "evaluations", "g"),
 )
 
@@ -165,7 +174,14 @@ def run(args: argparse.Namespace) -> None:
     rows = bench_bracket(files, studio, settings, args.ways, journal=Journal(args.out, same, len(args.ways)))
     report = Report(
         "bracket",
-        {"painter": args.painter, "preset": args.preset, "camera": "three-spheres", "normals": NORMALS},
+        {
+            "painter": args.painter,
+            "preset": args.preset,
+            "camera": "three-spheres",
+            "normals": NORMALS,
+            "darker_rmse": "of display values on the disc against the true ball, over exposures below EV 0",
+            "highlight_stops": "log2 of the darkest exposure's brightest hundredth over the truth's, in luminance",
+        },
         rows,
         summarize_groups(rows, ("way",), _IDEALS),
         time.perf_counter() - started,
@@ -207,7 +223,8 @@ def _measured(path: Path, studio: Studio, settings: Settings, way: str) -> Row:
     (camera,) = CAMERAS["three-spheres"](path.stem, settings.seed)
     shot = take(read_envmap(path), camera)
     painter = WAYS[way].around(studio.painter_of(VARIANTS[STEERED], shot))
-    probe = estimate(shot.photo_ldr, painter, replace(settings, bracket=WAYS[way].bracket))
+    sized = replace(settings, bracket=WAYS[way].bracket, height=shot.truth_hdr.shape[1])
+    probe = estimate(shot.photo_ldr, painter, sized)
     normals = spread_directions(NORMALS)
     lit, truth = irradiance(probe.latlong_hdr, normals), irradiance(shot.truth_hdr, normals)
     return {
@@ -217,5 +234,35 @@ def _measured(path: Path, studio: Studio, settings: Settings, way: str) -> Row:
         "irradiance_si_rmse": si_rmse(lit, truth),
         "irradiance_angular_error_deg": angular_error(lit, truth),
         "light_direction_error_deg": float(light_direction_error(probe.latlong_hdr, shot.truth_hdr)),
+        **_darker_figures(probe, shot.truth_hdr),
         "evaluations": probe.evaluations,
     }
+
+
+def _darker_figures(probe: Probe, truth_hdr: Latlong) -> Row:
+    """How near exposures below EV 0 are to the true ball's, and how bright the darkest one's lights are.
+
+    Returns:
+        `darker_rmse`, of display values on the disc, over those exposures; `highlight_stops`, log2 of the radiance of
+        the darkest one's brightest hundredth over the truth's. None where EV 0 is all there is.
+    """
+    disc = crop_disc(probe.ball) > 0
+    true = latlong_to_ball(truth_hdr, probe.ball.diameter)
+    darker = [
+        (exposure.ball[0][disc], expose(true, ev)[0][disc])
+        for ev, exposure in zip(probe.evs[1:], probe.exposures[1:], strict=True)
+    ]
+    if not darker:
+        return {"darker_rmse": None, "highlight_stops": None}
+    squares = [float((found - wanted).square().mean()) for found, wanted in darker]
+    found, wanted = (_highlight(picture) for picture in darker[-1])
+    return {
+        "darker_rmse": math.sqrt(sum(squares) / len(squares)),
+        "highlight_stops": math.log2(found / wanted),
+    }
+
+
+def _highlight(shown: Float[Tensor, "n 3"]) -> float:
+    """Mean luminance of the brightest hundredth of display values; at least a thousandth of a code of 8 bits."""
+    light = luminance(decode_display(shown))[:, 0]
+    return max(float(light.topk(max(1, len(light) // 100)).values.mean()), 1e-3 / 255)
