@@ -13,8 +13,8 @@ from dl_core.bench import lights as bench
 from dl_core.cli import main
 from dl_core.geometry import latlong_directions
 from dl_core.imageio import write_exr
-from dl_core.lights.choose import Candidate
 from dl_core.lights.model import LightModel
+from dl_core.lights.search import Candidate
 
 
 def sun_and_sky() -> torch.Tensor:

@@ -16,7 +16,8 @@ from typing import Final
 import torch
 
 from ..imageio import read_envmap
-from ..lights.choose import FULL_MAP, LEVELS, MOST_LIGHTS, Candidate, choose_light
+from ..lights.choose import LEVELS, MOST_LIGHTS, choose_light
+from ..lights.search import FULL_MAP, Candidate
 from ..lights.shading import ROWS
 from ..shapes import Latlong
 from ..spheres import MATERIALS
