@@ -85,13 +85,13 @@ class _Material:
     Attributes:
         size: side of its picture for measuring, pixels.
         render: (maps, size) -> pictures; linear in maps that are 0 or above.
-        render_discs: the same, faster, for maps that hold small lights alone.
+        quick: the same to 0.2%, for small lights and for pictures to look at.
         shows_directional: whether a light without extent is seen in it.
     """
 
     size: int
     render: Callable[[Latlong, int], BallImage]
-    render_discs: Callable[[Latlong, int], BallImage]
+    quick: Callable[[Latlong, int], BallImage]
     shows_directional: bool = True
 
 
@@ -105,7 +105,7 @@ def _diffuse(latlong: Latlong, size: int) -> BallImage:
     return received.unflatten(1, (size, size))
 
 
-def _diffuse_discs(latlong: Latlong, size: int) -> BallImage:
+def _quick_diffuse(latlong: Latlong, size: int) -> BallImage:
     return gathered_irradiance(latlong, sphere_normals(size)) * (ALBEDO / math.pi)
 
 
@@ -115,7 +115,7 @@ def _mirror(latlong: Latlong, size: int) -> BallImage:
 
 
 _MATERIALS: Final[dict[str, _Material]] = {
-    "diffuse": _Material(32, _diffuse, _diffuse_discs),  # nothing on it is smaller than tens of degrees
+    "diffuse": _Material(24, _diffuse, _quick_diffuse),  # nothing on it is smaller than tens of degrees
     "matte": _Material(64, _matte, _matte),
     "mirror": _Material(64, _mirror, _mirror, shows_directional=False),
 }
@@ -159,7 +159,9 @@ def _size(name: str, size: int | None) -> int:
 
 def shade_map(latlong_hdr: Latlong, materials: Sequence[str], size: int | None = None) -> Spheres:
     """Spheres under a map of `ROWS` rows: (1, pixels, 3) by material; of a given size, or that for measuring."""
-    return {name: _seen(_MATERIALS[name].render(latlong_hdr, _size(name, size))) for name in materials}
+    if size is None:
+        return {name: _seen(_MATERIALS[name].render(latlong_hdr, _MATERIALS[name].size)) for name in materials}
+    return {name: _seen(_MATERIALS[name].quick(latlong_hdr, size)) for name in materials}
 
 
 def shade_harmonics(coefficients: Float[Tensor, "n k 3"], materials: Sequence[str], size: int | None = None) -> Spheres:
@@ -177,7 +179,7 @@ def shade_lights(lights: Sequence[Light], materials: Sequence[str], size: int | 
     maps = disc_maps(torch.tensor([light.direction for light in lights]), radii, ROWS)
     colours = torch.tensor([light.irradiance for light in lights])[:, None, :]
     extended = torch.tensor([float(light.angular_radius is not None) for light in lights])[:, None, None]
-    spheres = {name: _seen(_MATERIALS[name].render_discs(maps, _size(name, size))) * colours for name in materials}
+    spheres = {name: _seen(_MATERIALS[name].quick(maps, _size(name, size))) * colours for name in materials}
     return {
         name: sphere if _MATERIALS[name].shows_directional else sphere * extended for name, sphere in spheres.items()
     }
