@@ -125,6 +125,7 @@ def test_the_bench_counts_what_maps_need_and_goes_on(
         assert sum(line[kind] for kind in bench.CLASSES) == line["panoramas"] == 3
         assert line["seconds_worst"] >= line["seconds_median"] > 0
     assert first["prepare_seconds"] > 0
+    assert first["prepare_cpu_seconds"] > 0
     monkeypatch.setattr(bench, "_decide", None)  # all is there
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out)["rows"] == first["rows"]
