@@ -13,8 +13,8 @@ from dl_core.bench import lights as bench
 from dl_core.cli import main
 from dl_core.geometry import latlong_directions
 from dl_core.imageio import write_exr
-from dl_core.lights.choose import Candidate
 from dl_core.lights.model import LightModel
+from dl_core.lights.search import Candidate
 
 
 def sun_and_sky() -> torch.Tensor:
@@ -125,6 +125,7 @@ def test_the_bench_counts_what_maps_need_and_goes_on(
         assert sum(line[kind] for kind in bench.CLASSES) == line["panoramas"] == 3
         assert line["seconds_worst"] >= line["seconds_median"] > 0
     assert first["prepare_seconds"] > 0
+    assert first["prepare_cpu_seconds"] > 0
     monkeypatch.setattr(bench, "_decide", None)  # all is there
     assert main(command) == 0
     assert json.loads(capsys.readouterr().out)["rows"] == first["rows"]

@@ -19,11 +19,12 @@ from dl_core.errors import OptionError, OutputError
 from dl_core.geometry import latlong_directions
 from dl_core.harmonics import sh_basis, sh_map
 from dl_core.imageio import read_envmap, write_exr
-from dl_core.lights.choose import Candidate, Decision
+from dl_core.lights.choose import Decision
 from dl_core.lights.describe import describe, describe_harmonics
 from dl_core.lights.export import write_lights
 from dl_core.lights.gltf import EXTENSION, gltf_scene
 from dl_core.lights.model import Light, LightModel
+from dl_core.lights.search import Candidate
 from dl_core.lights.usd import usd_stage
 from dl_core.metrics import irradiance
 

@@ -7,8 +7,9 @@ from typing import Any, Final
 from jaxtyping import Float
 from torch import Tensor
 
-from .choose import LEVELS, Candidate, Decision
+from .choose import LEVELS, Decision
 from .model import Light, LightModel
+from .search import Candidate
 from .shading import COSINE_LOBE
 
 __all__ = ["describe", "describe_harmonics", "describe_light"]

@@ -11,10 +11,11 @@ from typing import Final
 
 from ..errors import OptionError
 from ..imageio import atomic, require_writable, write_exr
-from .choose import Candidate, Decision
+from .choose import Decision
 from .describe import describe
 from .gltf import gltf_scene
 from .model import LightModel
+from .search import Candidate
 from .usd import usd_stage
 
 __all__ = ["EXPORTS", "check_export", "write_lights"]

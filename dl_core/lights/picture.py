@@ -16,7 +16,8 @@ from ..exposure import auto_exposure, encode_display
 from ..geometry import ball_coverage
 from ..resize import resize_latlong
 from ..shapes import BallImage, Latlong
-from .choose import LEVELS, Candidate, Decision
+from .choose import LEVELS, Decision
+from .search import Candidate
 from .shading import ROWS, model_pictures, shade_map, shade_model
 
 __all__ = ["decision_picture"]
@@ -53,7 +54,7 @@ def decision_picture(latlong_hdr: Latlong, decision: Decision) -> Float[Tensor, 
         (416, width, 3) display-encoded in [0, 1]; the width depends on the number of materials alone.
     """
     shown = _shown(decision)
-    truth = model_pictures(shade_map(resize_latlong(latlong_hdr.float(), ROWS), decision.materials, _SIZE), _SIZE)
+    truth = model_pictures(shade_map(resize_latlong(latlong_hdr.float().cpu(), ROWS), decision.materials, _SIZE), _SIZE)
     model = shown.model
     below = truth if model is None else model_pictures(shade_model(model, decision.materials, _SIZE), _SIZE)
     width = _GAP + len(decision.materials) * (_SIZE + _GAP)
