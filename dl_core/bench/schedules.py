@@ -16,7 +16,7 @@ from ..painter import Painter
 from ..presets import PAPER_EVS, PRESETS, Preset
 from .report import Row
 
-__all__ = ["GRIDS", "Schedule"]
+__all__ = ["GRIDS", "Schedule", "Varied"]
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ SOCKETS = {
     ),
     "BallGrid": ("image", "x y name"),
     "LoadPhotoFolder": ("", "images names report"),
+    "SpeedAccuracyChart": ("", "chart report"),
     "SaveEnvMap": ("latlong report", "path"),
     "LoadEnvMap": ("", "latlong"),
 }
