@@ -21,11 +21,11 @@ The bound, for N balls x_j with pixelwise median m:
    and painting until one is short enough is the fixed-width rule of Chow and Robbins (1965).
 
 Measured on balls of known errors, a fifth of them disco balls, with a tolerance of 0.02 (`PYTHONPATH=. python
-tests/bench_settling.py`, 200 trials a level): smooth errors of 0.01, 0.02, 0.03, 0.04 and 0.06 took 6.3, 6.4, 8.4, 12.2
-and 23.2 balls, and every median was within. The smallest fixed number whose plain median is within in 95% of trials is 5,
-7, 9, 11 and 19 if the error is known beforehand; over scenes of all five together it is 13, against 11.3 on average. So
-the bound is wider than it need be, which costs up to a fifth where much is painted, and what it saves is that nobody has
-to know the error.
+tests/bench_settling.py`, 200 trials a level): smooth errors of 0.01, 0.02, 0.03, 0.04 and 0.06 took 6.3, 6.4, 8.4,
+12.2 and 23.2 balls, and every median was within. The smallest fixed number whose plain median is within in 95% of
+trials is 5, 7, 9, 11 and 19 if the error is known beforehand; over scenes of all five together it is 13, against
+11.3 on average. So the bound is wider than it need be, which costs up to a fifth where much is painted, and what it
+saves is that nobody has to know the error.
 
 Sources: Bahadur, A note on quantiles in large samples (Annals of Mathematical Statistics 37, 1966); Price and Bonett,
 Estimating the variance of the sample median (Journal of Statistical Computation and Simulation 68, 2001); Box, Some

@@ -163,6 +163,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         depth_disc: str = BY_PRESET,
         tolerance: float = 0.0,
         min_balls: int = Rounds.minimum,
+        until: float = 1.0,
         bracket: str = "fixed",
         budget: float = 0.0,
         **options: Any,
@@ -175,7 +176,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
             pace_of = _bracket_painter(BarObserver(), clip, prompts, (0.0,), ev_min, options, finished=None)
             choice = choose(budget, pace_of, canvas, diameter, _presets(values, tolerance, min_balls))
             preset, told = choice.name, [choice.line(budget)]
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
         disc = _preset_disc(preset) if depth_disc == BY_PRESET else depth_disc
         place = (canvas, diameter, given(x), given(y), height, disc)
         settings = Settings(schedule, values, seed, merge, *place, bracket=bracket, darkest=ev_min)

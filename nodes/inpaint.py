@@ -194,10 +194,11 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         depth_model: DepthModel | None = None,
         tolerance: float = 0.0,
         min_balls: int = Rounds.minimum,
+        until: float = 1.0,
         **options: Any,
     ) -> io.NodeOutput:
         """Run Algorithm 1."""
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
         request = _request(image, depth, ball, ev, (seed,))
         observer = BarObserver()
         painter = _painter(observer, ball, mask, options)

@@ -85,7 +85,7 @@ def rounds_inputs(default: str) -> list[Any]:
             "preset",
             options=[CUSTOM, *PRESETS],
             default=default,
-            tooltip="A point between speed and accuracy; it replaces balls, rounds, strength, final and steps "
+            tooltip="A point between speed and accuracy; it replaces balls, rounds, strength, final, steps and until "
             "below. custom uses the values below.",
         ),
         io.Int.Input("balls", default=30, min=1, max=1000, tooltip="N, the balls of a median. The paper: 30."),
@@ -114,7 +114,7 @@ def rounds_inputs(default: str) -> list[Any]:
 
 
 def settling_inputs() -> list[Any]:
-    """When a round ends before all balls are painted."""
+    """When a round ends before all balls are painted, and a ball before all steps are done."""
     return [
         io.Float.Input(
             "tolerance",
@@ -134,6 +134,16 @@ def settling_inputs() -> list[Any]:
             max=1000,
             optional=True,
             tooltip="With a tolerance, the fewest balls of a round; never more than balls.",
+        ),
+        io.Float.Input(
+            "until",
+            default=1.0,
+            min=0.01,
+            max=1.0,
+            step=0.01,
+            optional=True,
+            tooltip="Share of the schedule after which the balls of a median stop, with the clean image predicted "
+            "there: cheaper and softer, and light is settled early. 1 denoises to the end, as the paper does.",
         ),
     ]
 
@@ -213,13 +223,14 @@ def rounds_of(
     steps: int,
     tolerance: float = 0.0,
     min_balls: int = Rounds.minimum,
+    until: float = 1.0,
 ) -> Rounds:
     """The schedule of a preset, or of the node's own values; with a tolerance above 0, until medians are settled.
 
     Raises:
         OptionError: an option out of range.
     """
-    schedule = Rounds(balls, rounds, strength, steps, final) if name == CUSTOM else preset(name).rounds
+    schedule = Rounds(balls, rounds, strength, steps, final, until) if name == CUSTOM else preset(name).rounds
     return replace(schedule, tolerance=tolerance or None, minimum=min_balls)
 
 
@@ -263,8 +274,9 @@ def comfy_painter(
 def exposure_lines(ev: float, seed: int, schedule: Rounds, result: IterativeResult, seconds: float) -> str:
     """What was run at an exposure, what it cost, how far its balls agree; one line, and one for each note."""
     most = "" if schedule.tolerance is None else "up to "
+    until = "" if schedule.until == 1 else f" until {schedule.until:g}"
     line = (
-        f"EV {ev:g}: {most}{schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps, "
+        f"EV {ev:g}: {most}{schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps{until}, "
         f"strength {schedule.strength:g}, seed {seed}; {result.evaluations} denoiser evaluations "
         f"in {seconds:.1f} s; mean spread {float(result.spread.mean()):.3f}"
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 from comfy_api.latest import io
 
 from ..dl_core.exposure import check_evs
-from .painting import rounds_inputs, rounds_of
+from ..dl_core.iterative import Rounds
+from .painting import rounds_inputs, rounds_of, settling_inputs
 from .sockets import CATEGORY, named_output, parse_evs
 
 __all__ = ["SpeedAccuracyChart"]
@@ -26,6 +27,7 @@ class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
             inputs=[
                 *rounds_inputs("balanced"),
                 io.Int.Input("steps", default=30, min=1, max=998, tooltip="Denoising steps of a full schedule."),
+                *settling_inputs(),
                 io.String.Input("evs", default="0, -2.5, -5", tooltip="Exposures, descending from 0."),
             ],
             outputs=[
@@ -36,12 +38,21 @@ class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
 
     @classmethod
     def execute(
-        cls, preset: str, balls: int, rounds: int, strength: float, final: bool, steps: int, evs: str
+        cls,
+        preset: str,
+        balls: int,
+        rounds: int,
+        strength: float,
+        final: bool,
+        steps: int,
+        evs: str,
+        tolerance: float = 0.0,
+        min_balls: int = Rounds.minimum,
+        until: float = 1.0,
     ) -> io.NodeOutput:
         """Draw the chart."""
         # matplotlib takes a second to import, which no other node should wait for.
         from ..dl_core.bench.shipped_chart import chart_of
 
-        return io.NodeOutput(
-            *chart_of(rounds_of(preset, balls, rounds, strength, final, steps), check_evs(parse_evs(evs)))
-        )
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
+        return io.NodeOutput(*chart_of(schedule, check_evs(parse_evs(evs))))

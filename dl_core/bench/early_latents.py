@@ -15,12 +15,11 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor
 
-from ..backends.diffusers_painter import DiffusersPainter, ball_latent_mask
 from ..ball import Ball, paste_ball
 from ..median import pixelwise_median
 from ..painter import PaintRequest
 from ..shapes import BallImage
-from .early_section import Scene, Section, ball_rmse, latents_of, require_latents
+from .early_section import LatentPainter, Scene, Section, ball_rmse, latents_of, require_latents
 from .paintings import VARIANTS
 from .report import Column, Row
 
@@ -141,9 +140,7 @@ class LatentsSection(Section):
         }
 
 
-def _sdedit(
-    painter: DiffusersPainter, request: PaintRequest, clean: Tensor, counted: Callable[[int], None]
-) -> BallImage:
+def _sdedit(painter: LatentPainter, request: PaintRequest, clean: Tensor, counted: Callable[[int], None]) -> BallImage:
     """The ball of a request, painted from clean latents of a canvas."""
     encoded = SimpleNamespace(latents=clean / painter.pipeline.vae.config.scaling_factor)
     return painter.decode_ball(painter.inpaint(request, encoded, counted), request.ball)
@@ -151,6 +148,8 @@ def _sdedit(
 
 def _differ(one: Tensor, other: Tensor, ball: Ball) -> float:
     """Distance of two latents inside the ball's disc, over the other's contrast there."""
+    from ..backends.diffusers_painter import ball_latent_mask
+
     inside = ball_latent_mask(replace(ball, dilation=0)).to(other) == 1
     first, second = (latents[inside.expand_as(latents)].view(latents.shape[1], -1) for latents in (one, other))
     return float((first - second).norm() / (second - second.mean(dim=1, keepdim=True)).norm())

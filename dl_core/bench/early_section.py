@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from ..backends.diffusers_painter import DiffusersPainter
 from ..ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, place_ball
 from ..errors import OptionError
 from ..exposure import expose
@@ -21,7 +21,7 @@ from .cameras import Camera, Shot, take
 from .painters import Studio
 from .report import Column, Row
 
-__all__ = ["Options", "Scene", "Section", "ball_rmse", "latents_of", "require_latents"]
+__all__ = ["LatentPainter", "Options", "Scene", "Section", "ball_rmse", "latents_of", "require_latents"]
 
 
 @dataclass(frozen=True)
@@ -113,18 +113,34 @@ def ball_rmse(one: BallImage, other: BallImage) -> float:
     return float((((one - other) ** 2 * inside).sum() / (3 * inside.sum())).sqrt())
 
 
-def require_latents(painter: Painter) -> DiffusersPainter:
+@runtime_checkable
+class LatentPainter(Painter, Protocol):
+    """A painter whose latents can be reached: `backends.diffusers_painter.DiffusersPainter`."""
+
+    pipeline: Any
+
+    def encode(self, canvas: Image) -> Any:
+        """What the autoencoder makes of a canvas."""
+
+    def inpaint(self, request: PaintRequest, encoded: Any, counted: Callable[[int], None]) -> Tensor:
+        """Latents of a request's balls."""
+
+    def decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
+        """Balls of latents."""
+
+
+def require_latents(painter: Painter) -> LatentPainter:
     """A painter whose latents can be reached.
 
     Raises:
         OptionError: another one.
     """
-    if not isinstance(painter, DiffusersPainter):
+    if not isinstance(painter, LatentPainter):
         raise OptionError("--painter", type(painter).__name__, "a painter on diffusers for this section")
     return painter
 
 
-def latents_of(painter: DiffusersPainter, canvas: Image) -> Tensor:
+def latents_of(painter: LatentPainter, canvas: Image) -> Tensor:
     """Clean latents of a canvas as the denoiser has them; the mode, where the autoencoder has one."""
     encoded = painter.encode(canvas)
     latents = encoded.latent_dist.mode() if hasattr(encoded, "latent_dist") else encoded.latents

@@ -197,7 +197,8 @@ def _schedule(rounds: Rounds) -> str:
     balls = f"N={rounds.balls}"
     if rounds.tolerance is not None:
         balls = f"N={rounds.counts[0]}-{rounds.balls} tolerance={rounds.tolerance:g}"
-    return f"{balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}"
+    until = "" if rounds.until == 1 else f" until={rounds.until:g}"
+    return f"{balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}{until}"
 
 
 def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]:
