@@ -104,17 +104,17 @@ def _variants(rounds: Rounds) -> Iterator[Schedule]:
 
 
 def _small() -> Iterator[tuple[Rounds, tuple[float, ...]]]:
-    """Cheap ones: few balls, few steps."""
-    for balls, steps in product((1, 3, 5, 9), (4, 6, 10)):
+    """Cheap ones: few balls, few steps, early answers."""
+    for balls, steps in ((1, 6), (3, 4), (3, 6), (5, 10), (9, 10)):
         yield Rounds(balls, 1, 0.8, steps, final=False), PAPER_EVS
-    for balls, steps in ((5, 10), (9, 10), (5, 20)):
-        yield Rounds(balls, 1, 0.8, steps), PAPER_EVS
+    for until, balls in product((0.3, 0.5), (3, 5, 9, 15, 30)):
+        yield Rounds(balls, 1, 0.8, 10, final=False, until=until), PAPER_EVS
+    for until in (0.3, 1.0):
+        yield Rounds(5, 1, 0.8, 10, until=until), PAPER_EVS
     for evs in (PAPER_EVS[:1], PAPER_EVS[::2]):
         yield Rounds(5, 1, 0.8, 10, final=False), evs
-    for until in (0.5, 0.75):
-        yield Rounds(5, 1, 0.8, 20, until=until), PAPER_EVS
     for tolerance in (0.03, 0.06):
-        yield Rounds(30, 1, 0.8, 10, final=False, tolerance=tolerance), PAPER_EVS
+        yield Rounds(30, 1, 0.8, 10, final=False, until=0.5, tolerance=tolerance), PAPER_EVS
 
 
 def _full() -> Iterator[tuple[Rounds, tuple[float, ...]]]:
