@@ -65,6 +65,13 @@ class DarkenedPainter:
     That median times 2^(step in EV) in linear light, pasted in the photograph, is the canvas of SDEdit. What clips in
     the brighter exposure is too dark in it, and left for the painter to brighten.
 
+    Measured with the mini model of 100,000 pictures on the six validation panoramas (`lightprobe bench bracket
+    --painter mini --ways fixed "median 0.8" "median 0.6" --panoramas DIR`, seed 0, draft): evaluations fall from 108 to
+    84 and 72, and the RMSE of darker exposures from 0.123 to 0.084 and 0.098 at the median; but in every scene the
+    darkest one's lights are dimmer: nearer the truth in the three where they were too bright, further in the others, at
+    worst -3.1 and -2.8 stops off in place of 1.9. The merged light is the same (si-RMSE of irradiance 0.736 each time,
+    as the model's EV 0 hardly clips). Lights are what darker exposures are painted for, so the start is not on offer.
+
     Attributes:
         painter: paints.
         strength: of SDEdit, above 0, below 1.
