@@ -53,8 +53,10 @@ DEFAULT_PRESET: Final = "balanced"
 PAPER_EVS: Final = (0.0, -2.5, -5.0)
 
 PRESETS: Final[dict[str, Preset]] = {
-    "draft": Preset(Rounds(balls=3, rounds=1, strength=0.8, steps=6, final=False), PAPER_EVS, "a first look"),
-    "balanced": Preset(Rounds(balls=5, rounds=1, strength=0.8, steps=20), PAPER_EVS, "a usable estimate"),
+    "draft": Preset(Rounds(5, 1, 0.8, 10, final=False, until=0.3), PAPER_EVS, "a first look"),
+    "fast": Preset(Rounds(9, 1, 0.8, 10, final=False, until=0.5), PAPER_EVS, "a look at the light"),
+    "balanced": Preset(Rounds(30, 1, 0.8, 10, final=False, until=0.5), PAPER_EVS, "a usable estimate"),
+    "best": Preset(Rounds(15, 2, 0.8, 20, final=False, until=0.5), PAPER_EVS, "the smallest error measured"),
     "turbo": Preset(
         Rounds(balls=1, rounds=0, steps=30, final=False),
         PAPER_EVS,

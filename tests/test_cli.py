@@ -323,7 +323,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--preset", "fast"], "preset is 'fast'; accepted: draft, balanced, turbo, paper"),
+        (["--preset", "quick"], "preset is 'quick'; accepted: draft, fast, balanced, best, turbo, paper"),
         (["--evs", "0,-2,-2"], "evs is"),
         (["--evs", "-1,-2"], "evs"),
         (["--evs=1,0"], "evs is"),

@@ -30,7 +30,7 @@ from dl_core.ball import place_ball
 from dl_core.errors import ImageError, ModelError, OptionError, OutputError
 from dl_core.exposure_prompts import embedding_at
 from dl_core.training import latent_cache
-from dl_core.training.denoiser import BLIND_ABOVE, blind_share, weighted_error
+from dl_core.training.denoiser import weighted_error
 from dl_core.training.exposure_lora import TrainedLora, train_exposure_loras
 from dl_core.training.latent_cache import LatentCache, data_fingerprint, encode_pairs
 from dl_core.training.lora_batches import LoraBatches
@@ -161,14 +161,20 @@ def test_timesteps_are_uniform_over_the_range_and_reach_both_ends(cache: LatentC
     assert ((counts - 200).abs() < 5 * 12).all()
 
 
-def test_where_the_model_is_blind_the_ball_is_noise_alone(cache: LatentCache) -> None:
-    """And the target still holds the ball."""
-    range_ = (BLIND_ABOVE, 999)
-    blind, seeing = (batches(cache, blind=b, timesteps=range_).batch(0) for b in (blind_share, lambda t: 0 * t))
-    assert torch.equal(blind.target, seeing.target)
-    differs = (blind.noisy - seeing.noisy).abs().amax(dim=1, keepdim=True) > 0
-    assert not differs[cache.discs(torch.tensor([0]), SIDE, dilated=True).expand_as(differs) == 0].any()
-    assert differs[blind.ball == 1].all()
+def test_a_model_that_starts_from_noise_sees_a_fainter_ball_and_the_same_photograph(cache: LatentCache) -> None:
+    """And what it is to predict leads to the whole ball from there."""
+    clean = cache.latents(torch.arange(cache.count))
+    for levels in ((820, 999), (300, 800)):
+        carried, full = (batches(cache, from_noise=f, timesteps=levels, size=5).batch(0) for f in (True, False))
+        differs = (carried.noisy - full.noisy).abs().amax(dim=1, keepdim=True) > 0
+        assert not differs[cache.discs(torch.tensor([0]), SIDE, dilated=True).expand_as(differs) == 0].any()
+        if levels[0] == 820:
+            assert differs[carried.ball == 1].all()
+        kept = DDPMScheduler(**SCHEDULER_CONFIG).alphas_cumprod[carried.timesteps].view(-1, 1, 1, 1)
+        for batch in (carried, full):
+            found = (batch.noisy - (1 - kept).sqrt() * batch.target) / kept.sqrt()
+            order = [int((clean - one).abs().amax(dim=(1, 2, 3)).argmin()) for one in found]
+            torch.testing.assert_close(found, clean[order], rtol=0, atol=1e-3)
 
 
 def test_prompts_at_an_exposure() -> None:

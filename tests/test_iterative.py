@@ -337,5 +337,5 @@ def test_a_strength_that_leaves_no_step_is_named() -> None:
 
 
 def test_an_unknown_preset_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(OptionError, match="draft, balanced, turbo, paper"):
-        preset("fast")
+    with pytest.raises(OptionError, match="draft, fast, balanced, best, turbo, paper"):
+        preset("quick")

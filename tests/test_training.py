@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffusers import AutoencoderTiny
+from diffusers import AutoencoderTiny, DDIMScheduler, DDPMScheduler
 from hypothesis import given
 from hypothesis import strategies as st
 from tolerances import assert_close
 from torch import Tensor, nn
 
-from dl_core.backends.diffusers_painter import DiffusersPainter
-from dl_core.backends.mini import LORA_FILE, MINI_FOLDER, NETWORK_FILES, MiniModel, load_mini
+from dl_core.backends.diffusers_painter import SAMPLERS, DiffusersPainter
+from dl_core.backends.mini import LORA_FILE, MINI_FOLDER, NETWORK_FILES, SCHEDULER_CONFIG, MiniModel, load_mini
 from dl_core.ball import disc_mask
 from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
@@ -26,7 +26,7 @@ from dl_core.geometry import latlong_energy
 from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
 from dl_core.training.control import train_control
 from dl_core.training.decoder import train_decoder
-from dl_core.training.denoiser import BLIND_ABOVE, BLIND_FROM, OFF_BALL_WEIGHT, draw_batch
+from dl_core.training.denoiser import OFF_BALL_WEIGHT, draw_batch
 from dl_core.training.drawn_pairs import DrawnPairs
 from dl_core.training.export import write_networks
 from dl_core.training.loop import Budget, train
@@ -34,6 +34,7 @@ from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_fil
 from dl_core.training.procedural import draw_panorama
 from dl_core.training.scenes import SceneSampler
 from dl_core.training.stages import run_stage
+from dl_core.training.starts import FIRST_START, SDEDIT_BELOW, SDEDIT_SHARE, carried_noise, draw_starts
 
 ROOT = Path(__file__).parents[1]
 
@@ -139,21 +140,56 @@ def test_a_batch_mixes_signal_and_noise_as_its_timesteps_say(panoramas: Tensor) 
     assert batch.weights.max() == pytest.approx(1.0)
 
 
-def test_at_the_noisiest_levels_a_ball_is_noise_alone_and_the_photograph_is_not(panoramas: Tensor) -> None:
+@pytest.mark.parametrize("steps", [6, 10, 30])
+def test_training_sees_what_diffusers_sampler_meets_on_its_way_from_noise(steps: int) -> None:
+    """DDIM with a denoiser that always knows the ball, started from noise alone."""
+    scheduler = SAMPLERS["ddim"](DDIMScheduler(**SCHEDULER_CONFIG, timestep_spacing="leading", steps_offset=1).config)
+    scheduler.set_timesteps(steps)
+    generator = torch.Generator().manual_seed(steps)
+    ball, latents = torch.randn(2, 1, 4, 8, 8, generator=generator)
+    start, kept = int(scheduler.timesteps[0]), scheduler.alphas_cumprod
+    assert start >= FIRST_START
+    noise, everywhere = latents / (1 - kept[start]).sqrt(), torch.ones(1, 1, 8, 8)
+    carried = carried_noise(noise, ball, everywhere, torch.tensor([start]), kept)
+    for timestep in scheduler.timesteps:
+        expected = scheduler.add_noise(ball, carried, timestep[None])
+        torch.testing.assert_close(latents, expected, rtol=0, atol=2e-5)
+        velocity = (kept[timestep].sqrt() * latents - ball) / (1 - kept[timestep]).sqrt()
+        torch.testing.assert_close(velocity, scheduler_velocity(ball, carried, timestep), rtol=0, atol=2e-4)
+        latents = scheduler.step(velocity, timestep, latents).prev_sample
+    torch.testing.assert_close(latents, ball, rtol=0, atol=0.2)
+
+
+def scheduler_velocity(ball: Tensor, noise: Tensor, timestep: Tensor) -> Tensor:
+    return DDPMScheduler(**SCHEDULER_CONFIG).get_velocity(ball, noise, timestep[None])
+
+
+def test_starts_lie_at_or_above_a_picture_and_sdedit_below_its_strength() -> None:
+    levels = torch.arange(1000)
+    starts = draw_starts(levels, torch.Generator().manual_seed(3))
+    sdedit = starts == -1
+    assert (starts[~sdedit] >= torch.maximum(levels[~sdedit], torch.tensor(FIRST_START))).all()
+    assert not sdedit[SDEDIT_BELOW:].any()
+    assert sdedit[:SDEDIT_BELOW].float().mean() == pytest.approx(SDEDIT_SHARE, abs=0.06)
+    assert (starts[990:] >= levels[990:]).all()
+
+
+def test_where_a_sampler_starts_a_ball_is_noise_alone_and_the_photograph_is_not(
+    panoramas: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # The same draws in two worlds: what differs between the batches comes from the pictures.
+    monkeypatch.setattr("dl_core.training.denoiser.draw_starts", lambda levels, generator: levels)
     one, other = (
         draw_batch(SceneSampler(light, 64, 32, seed=1, centred=1.0), 0, 24, full_canvas=128)
         for light in (panoramas, panoramas.flip(-1))
     )
+    assert torch.equal(one.timesteps, other.timesteps)
     differs = (one.noisy - other.noisy).abs().amax(dim=1)
     on_ball, beside = differs[:, 7:9, 7:9].amax(dim=(1, 2)), differs[:, 7:9, [1, 14]].amax(dim=(1, 2))
-    blind, seeing = one.timesteps >= BLIND_ABOVE, one.timesteps <= BLIND_FROM
-    assert blind.sum() >= 3
-    assert seeing.sum() >= 3
-    assert (on_ball[blind] == 0).all()
-    assert (on_ball[seeing] > 0).all()
-    assert (beside[blind] > 0).any()
-    torch.testing.assert_close(one.timesteps, other.timesteps)
+    visible = one.timesteps < 900
+    assert visible.sum() >= 3
+    assert (on_ball < 1e-5).all()
+    assert (beside[visible] > 1e-3).any()
 
 
 class _Line(nn.Module):

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("photo", metavar="PHOTO", help="photograph: JPEG, PNG, TIFF, WebP ...")
     add("-o", "--output", metavar="OUT.exr", required=True, help="map to write: .exr, or .hdr")
-    add("--preset", help="draft, balanced, turbo or paper (default: balanced)")
+    add("--preset", help="draft, fast, balanced, best, turbo or paper (default: balanced)")
     add(
         "--budget",
         type=float,

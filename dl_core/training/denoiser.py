@@ -4,11 +4,7 @@ The mini model predicts v = sqrt(ᾱ) ε - sqrt(1 - ᾱ) z (Salimans and Ho, Pro
 schedule is SDXL's. Predicting ε as SDXL does leaves a small network to state overall brightness and colour as a small
 difference between its input and its output at the noisiest steps, which is where lighting is settled.
 
-Painting starts from pure noise, but SDXL's schedule ends short of it: at its last step 0.5% of the picture's power is
-left, and the mean of a ball shows through. A model trained on that reads the ball's overall colour out of the noise it
-starts from, whatever the photograph shows. So at the noisiest levels the ball's latents are noise alone here, and the
-model learns to take its light from the photograph (Lin et al., Common Diffusion Noise Schedules and Sample Steps Are
-Flawed, WACV 2024, mend the same for whole pictures by another schedule).
+The ball's latents are those that a sampler which started from noise alone meets on its way (`starts`).
 """
 
 from __future__ import annotations
@@ -26,14 +22,12 @@ from ..backends.mini import SCHEDULER_CONFIG, MiniModel
 from ..ball import Ball, disc_mask
 from .autoencoder import block_latents
 from .scenes import BASE_CAPTIONS, SceneSampler
+from .starts import carried_noise, draw_starts
 
 __all__ = [
-    "BLIND_ABOVE",
-    "BLIND_FROM",
     "OFF_BALL_WEIGHT",
     "Batch",
     "TextBank",
-    "blind_share",
     "draw_batch",
     "latent_disc",
     "spell_out_attention",
@@ -43,11 +37,6 @@ __all__ = [
 ]
 
 _NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
-
-BLIND_FROM = 770
-"""Noise level from which balls are shown as noise alone, ever more of them; SDEdit starts below it."""
-BLIND_ABOVE = 800
-"""Noise level from which all balls are."""
 
 OFF_BALL_WEIGHT = 0.1
 """Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""
@@ -127,10 +116,9 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
     noise = torch.randn(clean.shape, generator=generator)
     side = clean.shape[-1]
     discs = torch.cat([latent_disc(picture.ball, side, grow=picture.ball.dilation) for picture in pictures])
-    blind = torch.rand(size, generator=generator) < blind_share(levels)
-    shown = clean * (1 - discs * blind.view(-1, 1, 1, 1))
+    noise = carried_noise(noise, clean, discs, draw_starts(levels, generator), _NOISE.alphas_cumprod)
     return Batch(
-        noisy=_NOISE.add_noise(shown, noise, levels),
+        noisy=_NOISE.add_noise(clean, noise, levels),
         timesteps=levels,
         target=_NOISE.get_velocity(clean, noise, levels),
         weights=OFF_BALL_WEIGHT + (1 - OFF_BALL_WEIGHT) * discs,
@@ -138,11 +126,6 @@ def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int,
         evs=torch.tensor([picture.ev for picture in pictures]),
         balls=tuple(picture.ball.enlarged(scale) for picture in pictures),
     )
-
-
-def blind_share(levels: Tensor) -> Tensor:
-    """Share of pictures whose ball is shown as noise alone, by noise level; the share of certainty is 1 and above."""
-    return (levels - BLIND_FROM) / (BLIND_ABOVE - BLIND_FROM)
 
 
 def latent_disc(ball: Ball, side: int, *, grow: float) -> Float[Tensor, "1 1 m m"]:

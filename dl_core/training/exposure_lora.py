@@ -250,7 +250,7 @@ def _train(frozen: _Frozen, job: LoraJob, chosen: Tensor, settings: LoraSettings
         settings.batch,
         settings.timesteps,
         settings.seed,
-        frozen.base.blind,
+        frozen.base.from_noise,
     )
 
     def loss_of_batch(number: int) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +17,6 @@ from ..backends.mini import MiniModel, ModelDefaults
 from ..backends.sdxl_files import load_base, load_controlnet
 from ..shapes import Image
 from .autoencoder import block_latents
-from .denoiser import blind_share
 
 __all__ = ["LoraBase"]
 
@@ -34,14 +32,14 @@ class LoraBase:
         source: name of the model for people: a file, a folder, or `mini`.
         pipeline: of SDXL's kind; its ControlNet may be missing.
         defaults: prompts and settings of painting.
-        blind: for noise levels, the share of pictures whose ball is shown as noise alone; None where the model was
-            not trained so.
+        from_noise: whether the model was trained on what a sampler meets that started from noise alone (`starts`), and
+            its LoRA is to be.
     """
 
     source: str
     pipeline: Any
     defaults: ModelDefaults
-    blind: Callable[[Tensor], Tensor] | None = None
+    from_noise: bool = False
 
     @staticmethod
     def from_files(model: Path, controlnet: Path | None, dtype: torch.dtype) -> LoraBase:
@@ -66,7 +64,7 @@ class LoraBase:
         """The mini model without the exposure LoRA it comes with, which is what is trained anew."""
         networks = {**vars(model), "lora": None}
         painter = DiffusersPainter.from_mini(MiniModel(**networks))
-        return _MiniBase("mini", painter.pipeline, model.defaults, blind_share)
+        return _MiniBase("mini", painter.pipeline, model.defaults, from_noise=True)
 
     @property
     def schedule(self) -> DDPMScheduler:

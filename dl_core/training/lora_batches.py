@@ -5,7 +5,6 @@ Source: DiffusionLight, Sec. 4.2 (Eq. 5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .latent_cache import LatentCache
+from .starts import carried_noise, draw_starts
 
 __all__ = ["LoraBatch", "LoraBatches", "diffusion_target"]
 
@@ -49,7 +49,7 @@ class LoraBatches:
         size: pairs to a batch.
         timesteps: first and last noise level, both included, all equally likely.
         seed: of order, levels and noise.
-        blind: see `LoraBase`.
+        from_noise: see `LoraBase`.
     """
 
     cache: LatentCache
@@ -58,7 +58,7 @@ class LoraBatches:
     size: int
     timesteps: tuple[int, int]
     seed: int
-    blind: Callable[[Tensor], Tensor] | None = None
+    from_noise: bool = False
 
     def batch(self, number: int) -> LoraBatch:
         """The batch of a number from 0."""
@@ -68,13 +68,12 @@ class LoraBatches:
         first, last = self.timesteps
         levels = torch.randint(first, last + 1, (self.size,), generator=generator)
         noise = torch.randn(clean.shape, generator=generator)
-        shown = clean
-        if self.blind is not None:
-            hidden = torch.rand(self.size, generator=generator) < self.blind(levels)
+        if self.from_noise:
             discs = self.cache.discs(indices, clean.shape[-1], dilated=True)
-            shown = clean * (1 - discs * hidden.view(-1, 1, 1, 1))
+            starts = draw_starts(levels, generator)
+            noise = carried_noise(noise, clean, discs, starts, self.schedule.alphas_cumprod)
         return LoraBatch(
-            noisy=self.schedule.add_noise(shown, noise, levels),
+            noisy=self.schedule.add_noise(clean, noise, levels),
             timesteps=levels,
             target=diffusion_target(self.schedule, clean, noise, levels),
             ball=self.cache.discs(indices, clean.shape[-1]),

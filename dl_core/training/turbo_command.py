@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add = parser.add_argument
     add("--photographs", type=Path, required=True, help="folder of photographs")
-    add("--preset", default="paper", help="how medians are painted: draft, balanced or paper (default: paper)")
+    add("--preset", default="paper", help="how medians are painted: any preset but turbo (default: paper)")
     add("--lora", type=Path, help="exposure LoRA to paint with (SDXL only; mini: its own)")
     add("--depth", type=Path, help="folder of a depth model; without it scenes count as far away")
     add_training_arguments(parser)

@@ -32,7 +32,7 @@ def run_turbo(args: argparse.Namespace, report: Callable[[str], None]) -> list[P
     """
     settings, chosen = settings_of(args), preset(args.preset)
     if chosen.rounds.rounds == 0:
-        raise OptionError("--preset", args.preset, "one that takes a median: draft, balanced or paper")
+        raise OptionError("--preset", args.preset, "one that takes a median: any but turbo")
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         then = "then `train lora --data WORK/medians --timesteps 800-999` takes any number"
         raise OptionError("torchrun", os.environ["WORLD_SIZE"], f"one process while medians are painted; {then}")

@@ -132,7 +132,7 @@ def test_workflows_cost_what_their_notes_say(name: str, guided_steps: int, lora:
 
 @pytest.mark.parametrize(
     ("name", "times", "guided_steps", "at_paper"),
-    [("spatially_varying", 9, 3132, 44388), ("batch_folder", 1, 348, 4932)],
+    [("spatially_varying", 9, 4050, 44388), ("batch_folder", 1, 450, 4932)],
 )
 def test_workflows_of_many_maps_cost_what_their_notes_say(
     name: str, times: int, guided_steps: int, at_paper: int
