@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
+from dl_core.bench.shipped_chart import chart_of, shipped_rows
 from dl_core.cli import main
+from dl_core.iterative import Rounds
 from dl_core.presets import PRESETS
 
 README = Path(__file__).parents[1] / "README.md"
@@ -36,3 +38,44 @@ def test_the_command_prints_the_table(capsys: pytest.CaptureFixture[str]) -> Non
     text = capsys.readouterr().out
     assert all(name in text for name in PRESETS)
     assert "4,932" in text
+
+
+def test_errors_and_costs_are_those_of_the_chart_that_comes_along() -> None:
+    rows = {row["schedule"]: row for row in shipped_rows()}
+    for name, preset in PRESETS.items():
+        assert rows[name]["nfe"] == 2 * preset.guided_steps
+        if preset.error_deg is not None:
+            assert preset.error_deg == pytest.approx(rows[name]["angular_error_deg"], abs=0.005)
+
+
+def test_presets_keep_their_promises() -> None:
+    """At a tenth of its cost the paper's errors, within their intervals; at a hundredth 1.3 of them."""
+    rows = {row["schedule"]: row for row in shipped_rows()}
+    paper, balanced, draft = (rows[name] for name in ("paper", "balanced", "draft"))
+    assert balanced["nfe"] <= paper["nfe"] / 10
+    assert draft["nfe"] <= paper["nfe"] / 100
+    for key in ("angular_error", "normalized_rmse", "si_rmse"):
+        name = f"{key}_deg" if key == "angular_error" else key
+        assert balanced[name] <= paper[f"{key}_high"]
+        assert draft[name] <= 1.3 * paper[name]
+
+
+def test_a_measured_schedule_is_a_star_and_another_one_a_line() -> None:
+    best = PRESETS["best"]
+    picture, told = chart_of(best.rounds, best.evs)
+    assert picture.ndim == 4
+    assert picture.shape[-1] == 3
+    assert 0 <= picture.min() < picture.max() <= 1
+    assert "1,440 denoiser evaluations" in told
+    assert f"{shipped_error('best'):.3g}" in told
+    other, said = chart_of(Rounds(7, 1, 0.8, 11), best.evs)
+    assert "were not measured" in said
+    assert (picture != other).any()
+    dear, advice = chart_of(PRESETS["turbo"].rounds, PRESETS["turbo"].evs)
+    assert dear.shape == picture.shape
+    assert "has" in advice
+    assert "degrees for" in advice
+
+
+def shipped_error(name: str) -> float:
+    return next(float(row["angular_error_deg"]) for row in shipped_rows() if row["schedule"] == name)

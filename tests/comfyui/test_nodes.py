@@ -517,3 +517,13 @@ def test_a_map_comes_back_from_the_ball_it_shows(node: Nodes, camera: dict[str, 
 def test_a_map_of_another_shape_is_named(node: Nodes) -> None:
     with pytest.raises(errors().OptionError, match="latlong"):
         node("EquirectToBall").execute(torch.rand(1, 16, 16, 3), 64, 0.0)
+
+
+def test_the_chart_points_at_a_preset_and_at_values_of_ones_own(node: Any) -> None:
+    values = {"balls": 5, "rounds": 1, "strength": 0.8, "final": False, "steps": 7, "evs": "0, -2.5, -5"}
+    pictures = {}
+    for preset in ("balanced", "custom"):
+        pictures[preset], told = node("SpeedAccuracyChart").execute(preset=preset, **values).args
+        assert ("not measured" in told) == (preset == "custom")
+    assert pictures["balanced"].shape == pictures["custom"].shape
+    assert (pictures["balanced"] != pictures["custom"]).any()
