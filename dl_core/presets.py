@@ -57,7 +57,7 @@ PRESETS: Final[dict[str, Preset]] = {
     "fast": Preset(Rounds(9, 1, 0.8, 10, final=False, until=0.5), PAPER_EVS, "a look at the light", error_deg=3.25),
     "balanced": Preset(Rounds(30, 1, 0.8, 10, final=False, until=0.5), PAPER_EVS, "a usable estimate", error_deg=3.09),
     "best": Preset(
-        Rounds(15, 2, 0.8, 20, final=False, until=0.5), PAPER_EVS, "the smallest error measured", error_deg=2.93
+        Rounds(15, 2, 0.8, 20, final=False, until=0.5), PAPER_EVS, "the smallest error measured", error_deg=2.94
     ),
     "turbo": Preset(
         Rounds(balls=1, rounds=0, steps=30, final=False),
