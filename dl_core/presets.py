@@ -41,7 +41,7 @@ class Preset:
         return {
             "preset": name,
             "EVs": ", ".join(f"{ev:g}" for ev in self.evs),
-            **{key: getattr(self.rounds, key) for key in ("balls", "rounds", "steps")},
+            **{key: getattr(self.rounds, key) for key in ("balls", "rounds", "steps", "until")},
             "guided_steps": self.guided_steps,
             "error_deg": self.error_deg,
             "summary": self.summary,

@@ -19,7 +19,8 @@ README = Path(__file__).parents[1] / "README.md"
 def markdown(name: str) -> str:
     row = PRESETS[name].row(name)
     error = "-" if row["error_deg"] is None else f"{row['error_deg']:.2f}"
-    cells = (f"`{name}`", row["EVs"], row["balls"], row["rounds"], row["steps"], f"{row['guided_steps']:,}", error)
+    cells = (f"`{name}`", row["EVs"], row["balls"], row["rounds"], row["steps"], f"{row['until']:g}")
+    cells += (f"{row['guided_steps']:,}", error)
     return f"| {' | '.join(map(str, cells))} | {row['summary']} |"
 
 

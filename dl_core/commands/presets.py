@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> None:
 def _table(rows: list[dict[str, Any]]) -> str:
     from ..bench.report import Column, table
 
-    forms = {"guided_steps": ",", "error_deg": ".2f", "seconds": ".1f"}
+    forms = {"until": "g", "guided_steps": ",", "error_deg": ".2f", "seconds": ".1f"}
     return table(rows, [Column(key.replace("_", " "), key, forms.get(key, "")) for key in rows[0]])
 
 
