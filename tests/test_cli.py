@@ -206,7 +206,7 @@ def test_depth_from_a_models_folder_is_that_of_each_round(
     painter = AnalyticPainter(sun_and_sky(), Flaws(noise=0.05))
     backend(painter)
     folder = save_depth_anything(tmp_path / "depth")
-    assert run(photo, out, "--depth", str(folder), "--preset", "balanced") == 0
+    assert run(photo, out, "--depth", str(folder), "--preset", "best") == 0
     first, last = painter.requests[:2]
     depth = load_depth_model(folder)
     for request in (first, last):
