@@ -305,7 +305,7 @@ def narrow_clip(graph: Any) -> Any:
         ({"tolerance": 1.5}, "OptionError", "^tolerance is 1.5"),
         ({"tolerance": 0.1, "min_balls": 1}, "OptionError", "^minimum is 1"),
         ({"merge": "guess"}, "OptionError", "^merge is 'guess'; accepted: robust, channel, paper"),
-        ({"preset": "best"}, "OptionError", "^preset is 'best'; accepted: draft"),
+        ({"preset": "quick"}, "OptionError", "^preset is 'quick'; accepted: draft"),
         ({"balls": 0}, "OptionError", "^balls is 0"),
         ({"depth_disc": "square"}, "OptionError", "^depth_disc is 'square'; accepted: ball, authors"),
         ({"impute": "none"}, "OptionError", "^impute is 'none'; accepted: initial, predicted"),
