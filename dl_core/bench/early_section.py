@@ -125,6 +125,9 @@ class LatentPainter(Painter, Protocol):
     def inpaint(self, request: PaintRequest, encoded: Any, counted: Callable[[int], None]) -> Tensor:
         """Latents of a request's balls."""
 
+    def decode(self, latents: Tensor) -> Image:
+        """Pictures of latents of any size."""
+
     def decode_ball(self, latents: Tensor, ball: Ball) -> BallImage:
         """Balls of latents."""
 
