@@ -63,7 +63,8 @@ def render_panorama(seed: int, height: int, samples: int = 64) -> Latlong:
     """The rendered panorama of a seed: a street for even seeds, a room for odd ones.
 
     Args:
-        seed: decides the scene and the noise of its render.
+        seed: decides the scene. The noise of its render repeats, too, unless Mitsuba takes the lights in another order,
+            which it does at times.
         height: rows of the map.
         samples: paths a pixel.
 
@@ -78,7 +79,7 @@ def render_panorama(seed: int, height: int, samples: int = 64) -> Latlong:
     for attempt in range(8):
         generator = torch.Generator().manual_seed(seed * 8 + attempt)
         shapes, eye = (_street if seed % 2 == 0 else _room)(mitsuba, generator)
-        # One after the other: in parallel lights come in any order, and with them the noise.
+        # One after the other: in parallel lights come in any order more often, and with them the noise.
         scene = mitsuba.load_dict(
             {"type": "scene", **{f"shape{i}": shape for i, shape in enumerate(shapes)}}, parallel=False
         )
