@@ -1,6 +1,6 @@
 """Time budgets: how long presets take on this machine, and the best that is ready in time.
 
-A short calibration paints a few balls with one denoising step and with several. What the steps add is the price of an
+A short calibration paints a few balls with few denoising steps and with more. What the steps add is the price of an
 evaluation; what is left is that of a ball: encoding, decoding, and whatever else a painting begins with.
 """
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from ..ball import Ball, crop_ball, disc_mask, fit_canvas, paint_depth, place_ball
+from ..ball import Ball, crop_disc, fit_canvas, paint_depth, place_ball
 from ..errors import OptionError
 from ..exposure import expose
 from ..geometry import latlong_to_ball
@@ -109,7 +109,7 @@ def ball_rmse(one: BallImage, other: BallImage) -> float:
     """Root mean square difference inside the ball, (1, D, D, 3) display-encoded each."""
     diameter = one.shape[1]
     ball = Ball(0, 0, diameter, diameter, 0)
-    inside = crop_ball(disc_mask(ball)[..., None], ball)
+    inside = crop_disc(ball)[None, ..., None]
     return float((((one - other) ** 2 * inside).sum() / (3 * inside.sum())).sqrt())
 
 

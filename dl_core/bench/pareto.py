@@ -36,7 +36,7 @@ from .front import on_front
 from .journal import Journal
 from .painters import PAINTERS, Studio, add_files, identity, open_studio
 from .paintings import VARIANTS
-from .pareto_files import write_files
+from .pareto_files import FIGURES, write_files
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 from .schedules import GRIDS, Schedule
 from .scoring import MAP_ROWS, PROTOCOLS, SPHERES, score_maps
@@ -47,7 +47,7 @@ __all__ = ["ERRORS", "add_arguments", "bench_pareto", "run", "summarize"]
 PROTOCOL: Final = "three-spheres"
 STEERED: Final = VARIANTS["both"]
 
-ERRORS: Final = ("angular_error_deg", "normalized_rmse", "si_rmse", "light_direction_error_deg")
+ERRORS: Final = tuple(key for key, _ in FIGURES)
 """Figures of a schedule, each with its interval; those of spheres are means over the three."""
 RANKED: Final = "angular_error_deg"
 """The figure that the front is of."""
@@ -99,9 +99,7 @@ def run(args: argparse.Namespace) -> None:
         seed=args.seed,
         report=_say,
     )
-    names = {path.stem for path in files}
-    measured = [row for row in journal.rows if row["panorama"] in names]
-    rows = summarize(measured, schedules, args.painter, args.seconds_per_step)
+    rows = summarize(journal.rows, schedules, args.painter, args.seconds_per_step)
     summary = [row for row in rows if row["on_front"]]
     protocol = {
         "painter": args.painter,
@@ -121,7 +119,7 @@ def run(args: argparse.Namespace) -> None:
         summary,
         time.perf_counter() - started,
         seeds=(args.seed,),
-        evaluations=sum(row["nfe"] for row in measured),
+        evaluations=sum(row["nfe"] for row in journal.rows),
     )
     if args.out is not None:
         write_files(args.out, rows, f"{args.painter}, panoramas: {len(files)}")
