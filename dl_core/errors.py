@@ -11,11 +11,23 @@ ProbeError
 
 from __future__ import annotations
 
+from typing import Any
+
 __all__ = ["ImageError", "Interrupted", "ModelError", "OptionError", "OutputError", "ProbeError", "ServerError"]
 
 
 class ProbeError(Exception):
     """Root of the tree: catching it catches every fault the library raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with attributes and message as they are, since a subclass makes the message from its arguments."""
+        return _again, (type(self), self.args, self.__dict__)
+
+
+def _again(kind: type[ProbeError], args: tuple[Any, ...], attributes: dict[str, Any]) -> ProbeError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(attributes)
+    return error
 
 
 class OptionError(ProbeError, ValueError):

@@ -190,6 +190,17 @@ def test_a_killed_run_goes_on_and_loses_one_estimate_at_most(
     assert timeless == [{key: value for key, value in row.items() if key != "seconds"} for row in whole["rows"]]
 
 
+def test_two_workers_measure_what_one_does(
+    maps: Path, few: dict[str, Schedule], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--panoramas", str(maps), "--painter", "perfect", "--only", "cheap,mid")
+    one = report_of(capsys, *options)
+    two = report_of(capsys, *options, "--workers", "2", "--out", str(tmp_path / "out"))
+    for mine, theirs in zip(two["rows"], one["rows"], strict=True):
+        assert {**mine, "seconds": None} == {**theirs, "seconds": None}
+    assert len((tmp_path / "out" / "rows.jsonl").read_text().splitlines()) == 1 + 2 * 2
+
+
 def test_a_schedule_that_changed_does_not_stand_beside_its_old_figures(
     maps: Path, few: dict[str, Schedule], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:

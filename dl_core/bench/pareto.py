@@ -5,7 +5,7 @@ counted; seconds are this machine's, and those of any other by seconds a guided 
 three-spheres protocol and the direction of the strongest light, with intervals over the scenes.
 
 Balls that schedules share are painted once (`shared_balls`), and what is measured is kept line by line, so a run that
-is killed goes on and loses one estimate at most.
+is killed goes on and loses one estimate of each of its processes at most. Processes take a panorama each.
 
 Source: DiffusionLight, Sec. 5.1 (errors) and the appendix on running time (the schedules it compares).
 """
@@ -16,8 +16,9 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Final
@@ -41,6 +42,7 @@ from .report import Column, Report, Row, add_output, add_panoramas, panorama_fil
 from .schedules import GRIDS, Schedule
 from .scoring import MAP_ROWS, PROTOCOLS, SPHERES, score_maps
 from .shared_balls import SharedBalls
+from .workers import check_workers, results_of
 
 __all__ = ["ERRORS", "add_arguments", "bench_pareto", "run", "summarize"]
 
@@ -63,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--convention", choices=PROTOCOLS[PROTOCOL].conventions, default="published", help="how errors are counted")
     add("--seconds-per-step", type=float, help="of a guided step on the machine to plan for, for a column of its own")
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
+    add("--workers", type=int, default=1, help="processes, each with a panorama at a time (default: 1)")
     add_files(parser)
     add_output(parser)
 
@@ -78,6 +81,7 @@ def run(args: argparse.Namespace) -> None:
     schedules = _schedules(args.grid, args.only)
     if args.seconds_per_step is not None and not args.seconds_per_step > 0:
         raise OptionError("--seconds-per-step", args.seconds_per_step, "above 0")
+    check_workers(args.workers)
     files = panorama_files(args.panoramas)
     prepare_output(args)
     models = ModelFiles.of(args)
@@ -92,11 +96,12 @@ def run(args: argparse.Namespace) -> None:
     journal = Journal(args.out, run_identity, unit=("panorama", "schedule"))
     bench_pareto(
         files,
-        studio,
+        (lambda: studio) if args.workers == 1 else partial(open_studio, args.painter, models),
         schedules,
         journal,
         convention=args.convention,
         seed=args.seed,
+        workers=args.workers,
         report=_say,
     )
     rows = summarize(journal.rows, schedules, args.painter, args.seconds_per_step)
@@ -151,47 +156,67 @@ def _interval_of(scenes: int) -> str:
 
 def bench_pareto(
     panoramas: Sequence[Path],
-    studio: Studio,
+    studio_of: Callable[[], Studio],
     schedules: Sequence[Schedule],
     journal: Journal,
     *,
     convention: str,
     seed: int = 0,
+    workers: int = 1,
     report: Callable[[str], None] = lambda line: None,
 ) -> None:
     """Measure every schedule on every panorama.
 
     Args:
         panoramas: maps.
-        studio: gives painter, canvas and ball.
+        studio_of: gives painter, canvas and ball; asked once a panorama.
         schedules: to compare.
         journal: holds what is measured already, and keeps the rest.
         convention: of `PROTOCOLS`' three spheres.
         seed: of the first ball.
+        workers: processes; what `studio_of` has to be for more than one, `workers.results_of` says.
         report: told of each estimate.
 
     Raises:
         OptionError: the journal holds a schedule of the same name that was something else.
     """
     _require_same(journal, schedules)
-    for path in panoramas:
-        wanted = [schedule for schedule in schedules if not journal.has(path.stem, schedule.name)]
-        if not wanted:
+    open_ones = [_Panorama(path, [s for s in schedules if not journal.has(path.stem, s.name)]) for path in panoramas]
+    task = partial(_measure_panorama, studio_of=studio_of, convention=convention, seed=seed)
+    for name, row in results_of(task, [one for one in open_ones if one.schedules], workers):
+        if row is None:
+            report(f"{name}: left out, this painter has no sampler or guidance to change")
             continue
-        shot = take(read_envmap(path), Camera())
-        own = studio.painter_of(STEERED, shot)
-        painters: dict[tuple[str | None, float | None], SharedBalls] = {}
-        base = Settings(seed=seed, canvas=studio.canvas, diameter=studio.diameter, darkest=darkest_of(own))
-        for schedule in wanted:
-            varied = schedule.painter(own)
-            if varied is None:
-                report(f"{path.stem} {schedule.name}: left out, this painter has no sampler or guidance to change")
-                continue
-            painter = painters.setdefault((schedule.sampler, schedule.guidance), SharedBalls(varied))
-            settings = replace(STEERED.settings(schedule.preset, base), bracket=schedule.bracket)
-            head = {"panorama": path.stem, "schedule": schedule.name, "settings": _told(schedule)}
-            journal.add([{**head, **_measure(shot, painter, settings, convention)}])
-            report(f"{path.stem} {schedule.name}: {journal.rows[-1]['nfe']} evaluations")
+        journal.add([row])
+        report(f"{name}: {row['nfe']} evaluations")
+
+
+@dataclass(frozen=True)
+class _Panorama:
+    """A map and the schedules that are not measured on it yet."""
+
+    path: Path
+    schedules: list[Schedule]
+
+
+def _measure_panorama(
+    panorama: _Panorama, studio_of: Callable[[], Studio], convention: str, seed: int
+) -> Iterator[tuple[str, Row | None]]:
+    """What is measured, by name, and its row; None for a schedule that the painter cannot run."""
+    studio, stem = studio_of(), panorama.path.stem
+    shot = take(read_envmap(panorama.path), Camera())
+    own = studio.painter_of(STEERED, shot)
+    painters: dict[tuple[str | None, float | None], SharedBalls] = {}
+    base = Settings(seed=seed, canvas=studio.canvas, diameter=studio.diameter, darkest=darkest_of(own))
+    for schedule in panorama.schedules:
+        name, varied = f"{stem} {schedule.name}", schedule.painter(own)
+        if varied is None:
+            yield name, None
+            continue
+        painter = painters.setdefault((schedule.sampler, schedule.guidance), SharedBalls(varied))
+        settings = replace(STEERED.settings(schedule.preset, base), bracket=schedule.bracket)
+        head = {"panorama": stem, "schedule": schedule.name, "settings": _told(schedule)}
+        yield name, {**head, **_measure(shot, painter, settings, convention)}
 
 
 def _told(schedule: Schedule) -> str:
@@ -243,7 +268,8 @@ def summarize(
     """
     rows = []
     for schedule in schedules:
-        own = [row for row in measured if row["schedule"] == schedule.name]
+        # By panorama, since workers end in any order and an interval's draws go by it.
+        own = sorted((row for row in measured if row["schedule"] == schedule.name), key=lambda row: row["panorama"])
         if not own:
             continue
         nfe = fmean(row["nfe"] for row in own)
