@@ -18,7 +18,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -197,12 +197,15 @@ def free_port() -> int:
 
 
 @contextmanager
-def launch(base: Path, port: int) -> Iterator[Server]:
-    """Run a ComfyUI server in a prepared folder. It may be killed and launched again, on the same port."""
+def launch(base: Path, port: int, variables: Mapping[str, str] | None = None) -> Iterator[Server]:
+    """Run a ComfyUI server in a prepared folder. It may be killed and launched again, on the same port.
+
+    `variables` are added to its environment.
+    """
     command = [sys.executable, "main.py", "--cpu", "--listen", "127.0.0.1", "--port", str(port)]
     command += ["--disable-auto-launch", "--base-directory", str(base)]
     command += ["--database-url", f"sqlite:///{base / 'comfyui.db'}"]
-    environment = os.environ | {"PYTHONPATH": str(STANDIN), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = os.environ | {"PYTHONPATH": str(STANDIN), "PYTHONDONTWRITEBYTECODE": "1"} | (variables or {})
     with (base / "server.log").open("a") as log:
         process = subprocess.Popen(command, cwd=COMFYUI, env=environment, stdout=log, stderr=log)
         try:
