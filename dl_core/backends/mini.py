@@ -10,7 +10,6 @@ the autoencoder in TAESD's shape. Latents are 8 times smaller than the picture a
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -24,6 +23,7 @@ from torch import nn
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
 from ..errors import ModelError
+from ..json_text import read_json
 from ..prompts import DARK_PROMPT, NEGATIVE_PROMPT, PROMPT
 
 __all__ = [
@@ -138,9 +138,8 @@ class MiniModel:
     def untrained(folder: Path = MINI_FOLDER) -> MiniModel:
         """The architecture with random weights (global torch seed), no LoRA; tokenizer and defaults from a folder."""
         try:
-            values = json.loads((folder / "mini.json").read_text())
-            defaults = ModelDefaults(**values)
-        except (OSError, TypeError, json.JSONDecodeError) as error:
+            defaults = _defaults(read_json(folder / "mini.json"))
+        except (OSError, TypeError, ValueError) as error:
             raise ModelError(
                 folder / "mini.json", f"cannot be used as the mini model's settings ({error!r})"
             ) from error
@@ -162,6 +161,23 @@ class MiniModel:
     def networks(self) -> dict[str, nn.Module]:
         """The networks by the names of `NETWORK_FILES`."""
         return {name: getattr(self, name) for name in NETWORK_FILES}
+
+
+def _defaults(values: Any) -> ModelDefaults:
+    """The defaults that a file states.
+
+    Raises:
+        TypeError: it states something else.
+        ValueError: one of them has another type, or the ball does not fit on the canvas.
+    """
+    defaults = ModelDefaults(**values)
+    kinds: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "str": (str,)}
+    for field in fields(defaults):
+        if type(getattr(defaults, field.name)) not in kinds[str(field.type)]:
+            raise ValueError(f"{field.name} is {getattr(defaults, field.name)!r}, {field.type} is accepted")
+    if not 0 < defaults.diameter < defaults.canvas:
+        raise ValueError(f"a ball of {defaults.diameter} on a canvas of {defaults.canvas} pixels")
+    return defaults
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:

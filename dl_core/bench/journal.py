@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..errors import OutputError
+from ..json_text import parse_json
 from .report import Row
 
 __all__ = ["Journal", "fingerprint"]
@@ -82,6 +83,6 @@ def _json_lines(path: Path) -> Iterator[Row]:
     """The lines of a file up to the first that is cut short."""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            yield dict(json.loads(line))
+            yield dict(parse_json(line))
         except (ValueError, TypeError):
             return

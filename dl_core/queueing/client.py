@@ -6,7 +6,6 @@ What a server says no to is `Refused`.
 
 from __future__ import annotations
 
-import json
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -22,6 +21,7 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from ..errors import OptionError, ServerError
+from ..json_text import parse_json
 from .workflow import Prompt
 
 __all__ = ["ComfyClient", "Events", "Fault", "QueueState", "Refused", "RemoteFile", "ServerAway", "run_faults"]
@@ -103,9 +103,20 @@ class Events:
                 return None
             except (WebSocketException, OSError) as error:
                 raise ServerAway(self._server, f"the websocket is closed ({error})") from error
-            message = json.loads(text) if isinstance(text, str) else None  # bytes are previews
-            if isinstance(message, dict) and isinstance(message.get("data"), dict):
+            if isinstance(text, str) and (message := _message(text)) is not None:  # bytes are previews
                 return message
+
+
+def _message(text: str) -> Mapping[str, Any] | None:
+    """A message of a type and its data; None for anything else that a server, or something before it, may send."""
+    try:
+        message = parse_json(text)
+    except ValueError:
+        return None
+    is_one = (
+        isinstance(message, dict) and isinstance(message.get("type"), str) and isinstance(message.get("data"), dict)
+    )
+    return message if is_one else None
 
 
 class ComfyClient:

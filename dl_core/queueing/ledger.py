@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from ..errors import OutputError
 from ..imageio import atomic
+from ..json_text import read_json
 from .client import RemoteFile
 from .workflow import Workflow
 
@@ -148,7 +149,14 @@ class Ledger:
 def _read_record(path: Path) -> Record | None:
     """A record; None for a file that is none, or is damaged: its photograph is then run again."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return Record(**{**content, "files": tuple(content["files"])})
+        content = read_json(path)
+        record = Record(**{**content, "files": tuple(content["files"])})
     except (OSError, ValueError, TypeError, KeyError):
         return None
+    texts = (record.key, record.name, record.photo, *record.files)
+    return record if all(map(_is_plain, texts)) else None
+
+
+def _is_plain(name: Any) -> bool:
+    """Whether it is the name of a file, and leads nowhere else."""
+    return isinstance(name, str) and bool(name) and "\0" not in name and Path(name).name == name

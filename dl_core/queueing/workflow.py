@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ..errors import OptionError
+from ..json_text import read_json
 
 __all__ = ["Prompt", "Workflow", "read_workflow"]
 
@@ -95,7 +96,7 @@ def read_workflow(path: str | Path, photo_node: str | None = None) -> Workflow:
 
 def _read_prompt(path: Path) -> Prompt:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except OSError as error:
         raise OptionError("workflow", str(path), f"a file that can be read ({error.strerror or error})") from error
     except ValueError as error:

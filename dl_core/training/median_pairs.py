@@ -9,7 +9,7 @@ Source: DiffusionLight, Algorithm 1 (the median); DiffusionLight-Turbo (a LoRA i
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -20,6 +20,7 @@ from ..ball import Ball, fit_canvas, paint_depth, paste_ball, place_ball
 from ..errors import ImageError, OptionError
 from ..imageio import read_photograph
 from ..iterative import Rounds, iterative_inpaint
+from ..json_text import read_json
 from ..painter import Observer, Painter, PaintRequest, SilentObserver
 from ..photo_folder import folder_files
 from ..shapes import Image
@@ -129,7 +130,10 @@ def _require_plan(out: Path, painting: MedianPainting, files: Sequence[Path]) ->
     if not path.is_file():
         write_json(path, plan)
         return
-    there: Mapping[str, Any] = json.loads(path.read_text())
+    try:
+        there = dict(read_json(path))
+    except (OSError, ValueError, TypeError) as error:
+        raise OptionError("--work", str(out), f"a folder whose {PLAN} can be read") from error
     for name, value in plan.items():
         if there.get(name) != value:
             raise OptionError(name, value, f"{there.get(name)!r}, what the medians in {out} are of; or another --work")

@@ -6,7 +6,6 @@ Any pair is read by itself: of a shard its table of contents, once, and then the
 from __future__ import annotations
 
 import io
-import json
 import tarfile
 from bisect import bisect_right
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from PIL import Image as PILImage
 
 from ..ball import Ball
 from ..errors import ImageError, OptionError
+from ..json_text import parse_json, read_json
 from ..shapes import Image
 
 __all__ = ["FORMAT", "INDEX", "Pair", "PairShards", "pair_key"]
@@ -93,7 +93,7 @@ class PairShards:
             if place not in self._contents:
                 self._contents[place] = _table_of_contents(path)
             picture, record = (_member(path, self._contents[place][f"{key}.{kind}"]) for kind in ("image.png", "json"))
-            return _pair(picture, json.loads(record))
+            return _pair(picture, parse_json(record))
         except (OSError, tarfile.TarError, KeyError, TypeError, ValueError, SyntaxError) as error:
             raise ImageError(path, f"is damaged at pair {key} ({error}); delete it and make the pairs again") from error
 
@@ -101,13 +101,24 @@ class PairShards:
 def _read_index(folder: Path) -> dict[str, Any]:
     accepted = "a folder that `lightprobe train data` has finished; run the same command again to go on"
     try:
-        index = json.loads((folder / INDEX).read_text())
+        index = dict(read_json(folder / INDEX))
         known = index["format"] == FORMAT
+        readable = not known or all(map(_is_entry, index["shards"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise OptionError("pairs", str(folder), accepted) from error
     if not known:
         raise OptionError("pairs", str(folder), f"shards of format {FORMAT}; these have {index['format']}")
-    return dict(index)
+    if not readable:
+        raise OptionError("pairs", str(folder), f"an {INDEX} that lists shards by file, split, pairs and bytes")
+    return index
+
+
+def _is_entry(entry: Any) -> bool:
+    """Whether an entry of the index says of a shard what has to be known."""
+    kinds = {"file": str, "split": str, "pairs": int, "bytes": int}
+    if not isinstance(entry, dict) or not all(type(entry.get(name)) is kind for name, kind in kinds.items()):
+        return False
+    return Path(entry["file"]).name == entry["file"] and entry["pairs"] > 0
 
 
 def _require_whole(path: Path, size: int) -> None:
@@ -133,4 +144,10 @@ def _member(path: Path, place: tuple[int, int]) -> bytes:
 def _pair(picture: bytes, record: dict[str, Any]) -> Pair:
     with PILImage.open(io.BytesIO(picture)) as image:
         codes = torch.from_numpy(np.array(image.convert("RGB")))
-    return Pair(codes[None].float() / 255, Ball(**record["ball"]), record["ev"], record["panorama"])
+    ball, ev, panorama = Ball(**record["ball"]), record["ev"], record["panorama"]
+    lengths = (ball.left, ball.top, ball.diameter, ball.canvas, ball.dilation)
+    if not all(type(length) is int for length in lengths) or codes.shape[:2] != (ball.canvas, ball.canvas):
+        raise ValueError(f"the ball is {record['ball']} on a picture of {codes.shape[1]} x {codes.shape[0]}")
+    if type(ev) not in (int, float) or not isinstance(panorama, str):
+        raise ValueError(f"EV {ev!r}, panorama {panorama!r}")
+    return Pair(codes[None].float() / 255, ball, ev, panorama)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from ..errors import ImageError, OptionError, OutputError
 from ..imageio import read_envmap, require_writable, write_exr
+from ..json_text import read_json
 from ..shapes import Latlong
 from .procedural import draw_panorama
 
@@ -42,7 +42,7 @@ def panorama_files(folder: Path, split: str) -> list[Path]:
     """
     manifest = folder / "manifest.json"
     try:
-        entries = [(str(entry["file"]), str(entry["split"])) for entry in json.loads(manifest.read_text())]
+        entries = [(str(entry["file"]), str(entry["split"])) for entry in read_json(manifest)]
     except OSError as error:
         raise OptionError("panoramas", str(folder), "a folder of HDR maps with a manifest.json") from error
     except (ValueError, TypeError, KeyError) as error:

@@ -15,6 +15,7 @@ from typing import Any, Final
 from .. import __version__
 from ..errors import OptionError, OutputError
 from ..imageio import atomic
+from ..json_text import read_json
 from .pairs import FORMAT
 from .screening import screen
 
@@ -102,7 +103,7 @@ def _read_plan(folder: Path) -> Plan | None:
             raise OptionError("out", str(folder), f"an empty folder, or one with a {PLAN}; this one holds other shards")
         return None
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(read_json(path))
     except (OSError, ValueError, TypeError) as error:
         raise OptionError("out", str(folder), f"a folder whose {PLAN} can be read") from error
 
