@@ -111,9 +111,13 @@ def load_depth_model(source: str | Path, *, download: bool = False, device: str 
         ModelError: nothing there, nothing that loads, or a model of another kind than `CONVENTIONS` knows.
     """
     folder = Path(source)
-    if folder.is_dir() and not (folder / "config.json").is_file():
+    try:
+        is_folder = folder.is_dir()
+    except (OSError, ValueError) as error:  # no file system takes such a name, and no hub such an id
+        raise ModelError(repr(str(source)), "names neither a folder nor a model of the hub") from error
+    if is_folder and not (folder / "config.json").is_file():
         raise ModelError(folder, f"holds no config.json; a folder with {FOLDER}, is accepted")
-    options = {"local_files_only": folder.is_dir() or not download}
+    options = {"local_files_only": is_folder or not download}
     # Late: it takes seconds to import.
     from transformers import AutoConfig, AutoImageProcessor, AutoModelForDepthEstimation
 

@@ -76,7 +76,8 @@ def sigmas_of(model: Any, sampler: str, scheduler: str, steps: int) -> torch.Ten
         levels = sampling.sigma(torch.tensor(leading_timesteps(steps), dtype=torch.float32))
         return torch.cat((levels.float().cpu(), torch.zeros(1)))
     schedule = comfy.samplers.KSampler(model, steps, "cpu", sampler, scheduler, denoise=1.0)
-    if len(schedule.sigmas) != steps + 1:
+    # ComfyUI's kl_optimal divides by 0 for one step.
+    if len(schedule.sigmas) != steps + 1 or not torch.isfinite(schedule.sigmas).all():
         raise OptionError("scheduler", scheduler, f"a schedule that can be cut into {steps} steps")
     return schedule.sigmas.float()
 
