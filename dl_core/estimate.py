@@ -15,6 +15,7 @@ from torch import Tensor
 
 from .ball import Ball, crop_disc, fit_canvas, paint_depth, paste_ball, place_ball
 from .bracket import check_bracket, darkest_of, hidden_radiance, ladder
+from .confidence import FEWEST, Confidence, bracket_spread, confidence_of
 from .errors import ImageError, OptionError
 from .exposure import check_evs, check_merge, merge_bracket
 from .geometry import ball_to_latlong
@@ -28,6 +29,7 @@ __all__ = [
     "Settings",
     "bracket_remarks",
     "check_photograph",
+    "confidence_remark",
     "estimate",
     "planned_evaluations",
     "planned_evs",
@@ -87,6 +89,7 @@ class Probe:
         settings: what was asked for.
         evaluations: denoiser evaluations spent.
         clipped: share of the ball that the darkest exposure still shows clipped, where lights end at its white.
+        confidence: what error to expect; None where an exposure has too few balls to differ.
     """
 
     latlong_hdr: Latlong
@@ -98,6 +101,7 @@ class Probe:
     settings: Settings
     evaluations: int
     clipped: float
+    confidence: Confidence | None = None
 
 
 def check_photograph(photo_ldr: Image, source: str = "photograph") -> Image:
@@ -187,8 +191,9 @@ def estimate(
     painted = evs[: len(exposures)]
     balls = [exposure.ball for exposure in exposures]
     ball_hdr = merge_bracket(balls, painted, settings.merge)
+    latlong_hdr = ball_to_latlong(ball_hdr, settings.height, painted=True)
     return Probe(
-        latlong_hdr=ball_to_latlong(ball_hdr, settings.height, painted=True),
+        latlong_hdr=latlong_hdr,
         ball_hdr=ball_hdr,
         evs=painted,
         exposures=exposures,
@@ -197,6 +202,7 @@ def estimate(
         settings=settings,
         evaluations=sum(exposure.evaluations for exposure in exposures),
         clipped=_clipped_share(balls, painted, settings.merge, ball),
+        confidence=_confidence(exposures, painted, latlong_hdr),
     )
 
 
@@ -239,6 +245,15 @@ def _matters(hidden: BallImage, known: BallImage, ball: Ball) -> bool:
     return float((hidden * disc).sum()) > HIDDEN_SHARE * float((known * disc).sum())
 
 
+def _confidence(
+    exposures: tuple[IterativeResult, ...], evs: tuple[float, ...], latlong_hdr: Latlong
+) -> Confidence | None:
+    opinions = [exposure.balls for exposure in exposures]
+    if min(map(len, opinions)) < FEWEST:
+        return None
+    return confidence_of(bracket_spread(opinions, evs), latlong_hdr)
+
+
 def _clipped_share(balls: list[BallImage], evs: tuple[float, ...], merge: str, ball: Ball) -> float:
     """Share of the ball where the merge would take from a further exposure."""
     disc = crop_disc(ball)[None]
@@ -257,3 +272,11 @@ def bracket_remarks(probe: Probe) -> list[str]:
             f"{2.0 ** -probe.evs[-1]:g}, where the map ends"
         )
     return remarks
+
+
+def confidence_remark(probe: Probe) -> str:
+    """What a report should say of how far the map can be trusted, one sentence."""
+    if probe.confidence is None:
+        fewest = min(len(exposure.balls) for exposure in probe.exposures)
+        return f"no expected error: {fewest} balls have no spread, {FEWEST} or more are needed"
+    return probe.confidence.line()

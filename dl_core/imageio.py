@@ -69,6 +69,8 @@ RENDER_LIMIT: Final = 2 * ROWS_LIMIT**2
 """Pixels a rendered picture may declare: those of the largest environment map."""
 DECODED_LIMIT: Final = 1 << 32
 """Bytes that all channels of an EXR file may take once decoded: 4 GiB."""
+CONFIDENCE_CHANNEL: Final = "confidence.Y"
+"""Of the layer that says how far each direction can be trusted (`confidence.Confidence.map`)."""
 _HEADER_BYTES: Final = 1 << 16
 _NAME_LIMIT: Final = 31
 """Longest attribute name that every EXR reader takes."""
@@ -151,7 +153,12 @@ def _latlong_array(latlong_hdr: Tensor) -> NDArray[np.float32]:
 
 
 def write_exr(
-    path: str | Path, latlong_hdr: Float[Tensor, "h w 3"], *, metadata: Mapping[str, str], half: bool = True
+    path: str | Path,
+    latlong_hdr: Float[Tensor, "h w 3"],
+    *,
+    metadata: Mapping[str, str],
+    half: bool = True,
+    confidence: Float[Tensor, "rows columns"] | None = None,
 ) -> Path:
     """Write a map as an EXR light probe: RGB, ZIP, Rec.709 chromaticities, `envmap` latlong.
 
@@ -160,12 +167,13 @@ def write_exr(
         latlong_hdr: (H, 2H, 3) linear radiance, finite, 0 or above.
         metadata: string attributes by name (1 to 31 characters; none that EXR itself defines).
         half: 16-bit floats; otherwise 32-bit. Half keeps 11 bits: steps of 0.05 to 0.1%.
+        confidence: (H, 2H) in [0, 1], kept as the channel `confidence.Y`, of the same type.
 
     Returns:
         The path.
 
     Raises:
-        ImageError: NaN, infinite or negative pixels, or another shape.
+        ImageError: NaN, infinite or negative pixels, or another shape; confidence of another size or outside [0, 1].
         OptionError: an attribute name that cannot be used.
         OutputError: the file cannot be written.
 
@@ -176,13 +184,26 @@ def write_exr(
     """
     pixels = _latlong_array(latlong_hdr)
     header = _exr_header(metadata)
-    pixels = _clamp_half(path, pixels).astype(np.float16) if half else pixels
+    kind = np.float16 if half else np.float32
+    pixels = _clamp_half(path, pixels).astype(kind) if half else pixels
+    channels = {"RGB": pixels}
+    if confidence is not None:
+        channels[CONFIDENCE_CHANNEL] = _confidence_array(confidence, pixels.shape[:2]).astype(kind)
     with atomic(path) as temporary:
         try:
-            OpenEXR.File(header, {"RGB": pixels}).write(str(temporary))
+            OpenEXR.File(header, channels).write(str(temporary))
         except RuntimeError as error:
             raise OutputError(path, f"cannot be written ({error})") from error
     return Path(path)
+
+
+def _confidence_array(confidence: Tensor, size: tuple[int, ...]) -> NDArray[np.float32]:
+    values = confidence.detach().cpu().float().numpy()
+    if values.shape != size:
+        raise ImageError("confidence", f"has shape {values.shape}, {size} as the map is accepted")
+    if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
+        raise ImageError("confidence", "holds values outside [0, 1]")
+    return np.ascontiguousarray(values)
 
 
 def _exr_header(metadata: Mapping[str, str]) -> dict[str, object]:

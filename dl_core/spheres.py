@@ -206,6 +206,7 @@ def sphere_sheet(
     evs: Sequence[float] = (),
     size: int = 256,
     albedo: float = ALBEDO,
+    confidence: Float[Tensor, "1 h w 1"] | None = None,
 ) -> Float[Tensor, "rows columns 3"]:
     """One picture for people: the photograph with its ball, the ball at each exposure, the map, spheres under it.
 
@@ -219,6 +220,7 @@ def sphere_sheet(
         evs: their exposure values.
         size: side of a tile in pixels.
         albedo: of the diffuse sphere.
+        confidence: (1, H, 2H, 1) in [0, 1], shown in a row of its own: white is sure.
 
     Returns:
         (rows, columns, 3) display-encoded in [0, 1].
@@ -237,7 +239,12 @@ def sphere_sheet(
         _Tile(f"ball, EV {ev:g}", _on_background(_fit(ball, size, size)))
         for ball, ev in zip(balls_ldr, evs, strict=True)
     ]
-    return _lay_out([row for row in (painted, _light_tiles(latlong_hdr, size, albedo)) if row], size)
+    trusted = [] if confidence is None else [_confidence_tile(confidence, size)]
+    return _lay_out([row for row in (painted, _light_tiles(latlong_hdr, size, albedo), trusted) if row], size)
+
+
+def _confidence_tile(confidence: Float[Tensor, "1 h w 1"], size: int) -> _Tile:
+    return _Tile("confidence: white sure, grey a stop off", _fit(confidence.expand(-1, -1, -1, 3), size, 2 * size))
 
 
 def _light_tiles(latlong_hdr: Latlong, size: int, albedo: float) -> list[_Tile]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from comfy_api.latest import ComfyExtension, io
 
 from .ball_grid import BallGrid
+from .confidence import ConfidenceMap
 from .depth_ball import CanvasToImage, DepthBallMask
 from .depth_model import EstimateDepth
 from .envmap_files import LoadEnvMap, SaveEnvMap
@@ -34,6 +35,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     FitBall,
     BallToEquirect,
     EquirectToBall,
+    ConfidenceMap,
     LightModel,
     EstimateLight,
     BallGrid,

@@ -11,7 +11,7 @@ import torch
 from comfy.cli_args import args
 from comfy_api.latest import io, ui
 
-from ..dl_core.errors import OutputError
+from ..dl_core.errors import OptionError, OutputError
 from ..dl_core.imageio import read_envmap, tone_map_preview, write_exr, write_hdr, write_png
 from .sockets import CATEGORY, as_rgb, named_output
 
@@ -48,21 +48,35 @@ class SaveEnvMap(io.ComfyNode):  # type: ignore[misc]
                 io.String.Input(
                     "report", optional=True, force_input=True, tooltip="What was run, to be kept in the file."
                 ),
+                io.Mask.Input(
+                    "confidence",
+                    optional=True,
+                    tooltip="Of Confidence Map or Estimate Light: kept in the EXR as the layer confidence.Y.",
+                ),
             ],
             outputs=[named_output(io.String, "path", "Where the EXR files are, one a line.")],
         )
 
     @classmethod
     def execute(
-        cls, latlong: torch.Tensor, filename_prefix: str, precision: str, radiance_hdr: bool, report: str = ""
+        cls,
+        latlong: torch.Tensor,
+        filename_prefix: str,
+        precision: str,
+        radiance_hdr: bool,
+        report: str = "",
+        confidence: torch.Tensor | None = None,
     ) -> io.NodeOutput:
         """Write every map of the batch and its preview."""
         maps = as_rgb(latlong, "latlong")
         metadata = _metadata(cls.hidden, report)
+        if confidence is not None and len(confidence) != len(maps):
+            raise OptionError("confidence", f"{len(confidence)} masks", f"one for each map, that is {len(maps)}")
+        layers = [None] * len(maps) if confidence is None else list(confidence)
         files, previews = [], []
-        for item in maps:
+        for item, layer in zip(maps, layers, strict=True):
             path, subfolder = _new_path(filename_prefix, item)
-            write_exr(path, item, metadata=metadata, half=precision == "half")
+            write_exr(path, item, metadata=metadata, half=precision == "half", confidence=layer)
             files.append(ui.SavedResult(path.name, subfolder, io.FolderType.output))
             if radiance_hdr:
                 write_hdr(path.with_suffix(".hdr"), item)

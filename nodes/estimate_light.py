@@ -19,6 +19,7 @@ from ..dl_core.estimate import (
     Settings,
     bracket_remarks,
     check_photograph,
+    confidence_remark,
     estimate,
     planned_evaluations,
     planned_evs,
@@ -28,6 +29,7 @@ from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import Rounds
 from ..dl_core.presets import PRESETS, Preset
 from ..dl_core.prompts import NEGATIVE_PROMPT
+from .confidence import CONFIDENCE_TOOLTIP
 from .depth_ball import depth_input, given, place_inputs
 from .doubts import doubts
 from .exposure import (
@@ -132,6 +134,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                 named_output(io.Image, "balls", "The ball at each EV, display-encoded, as one batch."),
                 named_output(BallSocket, "ball", "Where the ball sits."),
                 named_output(io.String, "report", "What was run and what it cost."),
+                named_output(io.Mask, "confidence", CONFIDENCE_TOOLTIP + " All 0 where there were too few balls."),
             ],
         )
 
@@ -187,7 +190,14 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         probe = estimate(photo, painter, settings, depth=near, depth_of=depth_model, observer=observer)
         found = torch.cat([exposure.ball for exposure in probe.exposures])
         report = "\n".join([*told, _report(probe, painter.seconds), *doubts(cls.hidden, preset, options["model"])])
-        return io.NodeOutput(probe.latlong_hdr, probe.ball_hdr, probe.composite_ldr, found, probe.ball, report)
+        shown = (probe.latlong_hdr, probe.ball_hdr, probe.composite_ldr, found, probe.ball)
+        return io.NodeOutput(*shown, report, _confidence(probe))
+
+
+def _confidence(probe: Probe) -> torch.Tensor:
+    if probe.confidence is None:
+        return torch.zeros_like(probe.latlong_hdr[..., 0])
+    return probe.confidence.map[..., 0]
 
 
 def _presets(evs: tuple[float, ...], tolerance: float, min_balls: int) -> dict[str, Preset]:
@@ -243,4 +253,6 @@ def _report(probe: Probe, seconds: dict[float, float]) -> str:
         exposure_lines(ev, settings.seed, settings.rounds, result, seconds[ev])
         for ev, result in zip(probe.evs, probe.exposures, strict=True)
     ]
-    return "\n".join([*lines, *bracket_remarks(probe), merge_summary(probe.evs, settings.merge)])
+    return "\n".join(
+        [*lines, *bracket_remarks(probe), confidence_remark(probe), merge_summary(probe.evs, settings.merge)]
+    )

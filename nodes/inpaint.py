@@ -173,6 +173,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 named_output(io.Image, "spread", "How far the last round's balls lie from it: their median deviation."),
                 named_output(io.Image, "composite", "The canvas image with the answer pasted in."),
                 named_output(io.String, "report", "What was run and what it cost."),
+                named_output(io.Image, "balls", "The balls of the last median, cut out, for Confidence Map."),
             ],
         )
 
@@ -209,4 +210,4 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         if ev == 0:  # once a bracket
             lines += doubts(cls.hidden, preset, options["model"])
         composite = paste_ball(request.canvas, result.ball, ball)
-        return io.NodeOutput(result.ball, result.median, result.spread, composite, "\n".join(lines))
+        return io.NodeOutput(result.ball, result.median, result.spread, composite, "\n".join(lines), result.balls)

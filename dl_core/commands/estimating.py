@@ -22,7 +22,7 @@ from ..bracket import check_bracket, ladder
 from ..budget import check_budget, choose
 from ..depth import load_depth_model
 from ..errors import OptionError
-from ..estimate import Probe, Settings, bracket_remarks, estimate, planned_evaluations
+from ..estimate import Probe, Settings, bracket_remarks, confidence_remark, estimate, planned_evaluations
 from ..exposure import check_evs, check_merge
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
 from ..iterative import Rounds, Tally, tally_lines
@@ -34,7 +34,12 @@ from ..spheres import sphere_sheet
 __all__ = ["probe_metadata", "run"]
 
 _WRITERS: Final[dict[str, Callable[[Path, Probe, dict[str, str]], Path]]] = {
-    ".exr": lambda path, probe, metadata: write_exr(path, probe.latlong_hdr[0], metadata=metadata),
+    ".exr": lambda path, probe, metadata: write_exr(
+        path,
+        probe.latlong_hdr[0],
+        metadata=metadata,
+        confidence=None if probe.confidence is None else probe.confidence.map[0, ..., 0],
+    ),
     ".hdr": lambda path, probe, metadata: write_hdr(path, probe.latlong_hdr[0]),
 }
 
@@ -188,6 +193,7 @@ def probe_metadata(probe: Probe) -> dict[str, str]:
         "lightprobe:evs": ", ".join(f"{ev:g}" for ev in probe.evs),
         "lightprobe:seed": str(settings.seed),
         "lightprobe:nfe": str(probe.evaluations),
+        "lightprobe:confidence": confidence_remark(probe),
         "lightprobe:axes": "centre -Z (where the camera looked), right of it +X, up +Y",
     }
 
@@ -203,7 +209,10 @@ def _schedule(rounds: Rounds) -> str:
 
 def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]:
     balls = [exposure.ball for exposure in probe.exposures]
-    sheet = sphere_sheet(probe.latlong_hdr, composite_ldr=probe.composite_ldr, balls_ldr=balls, evs=probe.evs)
+    confidence = None if probe.confidence is None else probe.confidence.map
+    sheet = sphere_sheet(
+        probe.latlong_hdr, composite_ldr=probe.composite_ldr, balls_ldr=balls, evs=probe.evs, confidence=confidence
+    )
     write_map = _WRITERS[outputs.map.suffix.lower()]
     return [
         write_map(outputs.map, probe, probe_metadata(probe) | extra),
@@ -225,7 +234,10 @@ def _report(
             for note in (*exposure.notes, *tally_lines(exposure, probe.settings.rounds))
         ),
         *bracket_remarks(probe),
+        confidence_remark(probe),
     ]
+    if probe.confidence is not None and Path(args.output).suffix.lower() == ".hdr":
+        notes.append("a Radiance file has no layers: the confidence map goes with an .exr")
     if args.json:
         report = {
             "written": [str(path) for path in written],
@@ -238,6 +250,7 @@ def _report(
             "evs": list(probe.evs),
             "rounds": [[_tally(tally) for tally in exposure.tallies] for exposure in probe.exposures],
             "clipped": probe.clipped,
+            "expected_error_stops": None if probe.confidence is None else probe.confidence.expected_error,
             "seed": args.seed,
             "version": __version__,
             "notes": notes,

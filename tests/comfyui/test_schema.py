@@ -22,22 +22,23 @@ SOCKETS = {
     ),
     "IterativeMedian": (
         "model positive negative vae control_net image depth ball mask ev depth_model",
-        "ball median spread composite report",
+        "ball median spread composite report balls",
     ),
     "CanvasToImage": ("canvas_image image ball", "image framed mask"),
     "HDRMerge": ("balls ev report", "hdr report"),
     "FitBall": ("balls photograph ball", "fit report"),
     "BallToEquirect": ("image ball fit", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),
+    "ConfidenceMap": ("balls ev latlong", "confidence picture expected_error report"),
     "LightModel": ("latlong", "latlong report picture"),
     "EstimateLight": (
         "model clip vae control_net image depth depth_model",
-        "latlong hdr composite balls ball report",
+        "latlong hdr composite balls ball report confidence",
     ),
     "BallGrid": ("image", "x y name"),
     "LoadPhotoFolder": ("", "images names report"),
     "SpeedAccuracyChart": ("", "chart report"),
-    "SaveEnvMap": ("latlong report", "path"),
+    "SaveEnvMap": ("latlong report confidence", "path"),
     "LoadEnvMap": ("", "latlong"),
 }
 WIDGETS = ("INT", "FLOAT", "STRING", "BOOLEAN", "COMBO")
