@@ -30,6 +30,7 @@ __all__ = [
     "encode_display",
     "expose",
     "exposure_error",
+    "exposure_ratio",
     "luminance",
     "merge_bracket",
     "merge_channel",
@@ -169,17 +170,33 @@ def exposure_error(
     Source: Mitsunaga and Nayar, Radiometric self calibration (CVPR 1999), for exposure ratios measured from the
     pictures.
     """
-    floor = max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
-    known = (brighter >= floor) & (brighter < CLIP_THRESHOLD)
-    if int(known.sum()) < EVIDENCE_COUNT:
+    compared = exposure_ratio(brighter, darker, stops, gamma)
+    if compared is None:
         return 0.0
-    ratios = torch.log2(darker[known].clamp(min=1e-6) / brighter[known]) + stops
-    error = float(ratios.median())
-    scatter = float((ratios - error).abs().median())
+    error, scatter = compared
     doubt = scatter + max(0.0, abs(error) - LARGEST_ERROR)
     trust = min(1.0, max(0.0, (DISTRUST - doubt) / (DISTRUST - TRUST)))
     excess = min(max(abs(error) - scatter - DEAD_ZONE, 0.0), LARGEST_ERROR)
     return math.copysign(excess, error) * trust
+
+
+def exposure_ratio(
+    brighter: Float[Tensor, "*n 3"], darker: Float[Tensor, "*n 3"], stops: float, gamma: float = GAMMA
+) -> tuple[float, float] | None:
+    """Stops by which an exposure is brighter than its EV says, and the scatter of that over the picture.
+
+    Args: as `exposure_error`, which says what is compared.
+
+    Returns:
+        Median and median absolute deviation of the ratios, both in stops; None for fewer than 100 values to compare.
+    """
+    floor = max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
+    known = (brighter >= floor) & (brighter < CLIP_THRESHOLD)
+    if int(known.sum()) < EVIDENCE_COUNT:
+        return None
+    ratios = torch.log2(darker[known].clamp(min=1e-6) / brighter[known]) + stops
+    error = float(ratios.median())
+    return error, float((ratios - error).abs().median())
 
 
 def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:

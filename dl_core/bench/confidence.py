@@ -41,7 +41,7 @@ from .cameras import random_camera, take
 from .journal import Journal
 from .painters import PAINTERS, Studio, add_files, identity, open_studio
 from .paintings import VARIANTS
-from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
+from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, split_files
 from .workers import check_workers, results_of
 
 __all__ = ["add_arguments", "fit_weights", "held_by_least_trusted", "log_error", "rank_correlation", "run"]
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> None:
         raise OptionError("--calibration", str(args.calibration), "nothing beside --calibrate: it makes one")
     check_workers(args.workers)
     chosen = preset(args.preset)
-    files = _files(args.panoramas, args.split)
+    files = panorama_files(args.panoramas) if args.split is None else split_files(args.panoramas, args.split)
     if args.calibrate is not None:
         require_writable(args.calibrate)
     calibration = shipped_calibration() if args.calibration is None else Calibration.read(args.calibration)
@@ -139,14 +139,6 @@ class _Asked:
 
     settings: Settings
     cameras: int
-
-
-def _files(folder: Path, split: str | None) -> list[Path]:
-    if split is None:
-        return panorama_files(folder)
-    from ..training.panoramas import panorama_files as files_of_split
-
-    return sorted(files_of_split(folder, split))
 
 
 def _measure_panorama(path: Path, studio_of: Callable[[], Studio], asked: _Asked) -> Iterator[list[Row]]:

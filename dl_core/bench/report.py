@@ -37,6 +37,7 @@ __all__ = [
     "panorama_files",
     "prepare_output",
     "publish",
+    "split_files",
     "summarize_groups",
     "table",
 ]
@@ -112,6 +113,17 @@ def panorama_files(folder: Path) -> list[Path]:
     if not files:
         raise OptionError("--panoramas", str(folder), "a folder with .exr or .hdr environment maps")
     return files
+
+
+def split_files(folder: Path, split: str) -> list[Path]:
+    """The maps of a split of a folder whose manifest.json names splits, by name.
+
+    Raises:
+        OptionError: no manifest, or no such split.
+    """
+    from ..training.panoramas import panorama_files as files_of_split
+
+    return sorted(files_of_split(folder, split))
 
 
 def prepare_output(args: argparse.Namespace) -> None:
