@@ -60,7 +60,9 @@ COMMANDS: Final[dict[str, Command]] = {
     "presets": Command("what each preset paints, costs and reaches", ".commands.presets"),
     "spheres": Command("show diffuse and mirror spheres under an environment map", ".commands.spheres"),
     "lights": Command("find the smallest light that stands for an environment map", ".commands.lights"),
-    "inspect": Command("print header, metadata and energy of an environment map", ".commands.inspect"),
+    "inspect": Command(
+        "what an environment map or a ball holds, and how good a mirror ball it is", ".commands.inspect"
+    ),
     "bench": Command("measure stages of the method against the truth", ".bench.cli"),
     "train": Command("make training data and train the mini model or the exposure LoRA", ".training.cli"),
 }

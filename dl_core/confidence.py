@@ -144,7 +144,7 @@ class Confidence:
         )
 
 
-def bracket_spread(balls: Sequence[BallImage], evs: Sequence[float]) -> Spread:
+def bracket_spread(balls: Sequence[Float[Tensor, "_ d d 3"]], evs: Sequence[float]) -> Spread:
     """How the balls of a bracket differ where the merge takes its light.
 
     Args:

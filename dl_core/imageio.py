@@ -40,6 +40,7 @@ __all__ = [
     "Render",
     "atomic",
     "exr_channels",
+    "is_envmap",
     "is_exr",
     "read_envmap",
     "read_exr_header",
@@ -451,6 +452,15 @@ def is_exr(path: str | Path) -> bool:
         ImageError: it cannot be read.
     """
     return _first_bytes(Path(path), 4) == exr_header.MAGIC
+
+
+def is_envmap(path: str | Path) -> bool:
+    """Whether a file begins as environment maps do: EXR or Radiance.
+
+    Raises:
+        ImageError: it cannot be read.
+    """
+    return is_exr(path) or _is_radiance(Path(path))
 
 
 def _is_radiance(path: Path) -> bool:

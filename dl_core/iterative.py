@@ -1,7 +1,7 @@
 """Iterative inpainting: N balls, their median, and again from there.
 
-With a tolerance a round ends once its median is settled (`settling`), N being the most that it paints; balls that are
-not like the others (`outliers`) are left out of the median.
+With a tolerance a round ends once its median is settled (`settling`), N being the most that it paints. Balls that are
+not like the others (`outliers`) are then left out of the median, and without a tolerance where that is asked for.
 
 Source: DiffusionLight, Algorithm 1 and Sec. 4.1.
 """
@@ -53,6 +53,7 @@ class Rounds:
         tolerance: error that a median may have, as `settling.error_bound` bounds it, in display values; a round ends
             once its median is within. Without one every round paints N balls.
         minimum: fewest balls of a round with a tolerance, N being the most in any case.
+        reject: whether balls unlike the others are left out of medians without a tolerance, too.
     """
 
     balls: int = 30
@@ -63,6 +64,7 @@ class Rounds:
     until: float = 1.0
     tolerance: float | None = None
     minimum: int = 6
+    reject: bool = False
 
     def __post_init__(self) -> None:
         if not 1 <= self.balls <= 1000:
@@ -92,7 +94,7 @@ class Tally:
 
     Attributes:
         painted: balls painted.
-        left_out: seeds of those that are not in the median, being unlike the others; none without a tolerance.
+        left_out: seeds of those that are not in the median, being unlike the others; none where nothing is rejected.
         error: bound on the median's error when the round ended, see `settling.error_bound`; None without a tolerance.
     """
 
@@ -236,7 +238,7 @@ def _settle(
         balls, count = torch.cat(painted), wanted
         heard(balls)
         if rounds.tolerance is None:
-            continue
+            break
         strange = find_outliers(balls, disc)
         kept = balls[~strange]
         weight = disc if used is None else disc * used[0].to(disc)
@@ -244,7 +246,10 @@ def _settle(
         if error <= rounds.tolerance or wanted == rounds.balls:
             left_out = tuple(seed + j for j in strange.nonzero()[:, 0].tolist())
             return kept, Tally(count, left_out, error)
-    return balls, Tally(count)
+    if not rounds.reject:
+        return balls, Tally(count)
+    strange = find_outliers(balls, disc)
+    return balls[~strange], Tally(count, tuple(seed + j for j in strange.nonzero()[:, 0].tolist()))
 
 
 def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[Image], Image] | None) -> PaintRequest:
@@ -274,16 +279,18 @@ def _counted(cost: Callable[[int, int, float, float], int], rounds: Rounds) -> i
 
 
 def tally_lines(result: IterativeResult, rounds: Rounds) -> list[str]:
-    """What a report should say of rounds with a tolerance, one sentence a round; nothing without one."""
+    """What a report should say of rounds that end by themselves or leave balls out, one sentence a round."""
     lines = []
     for number, tally in enumerate(result.tallies, 1):
+        seeds = ", ".join(map(str, tally.left_out))
         if rounds.tolerance is None or tally.error is None:
+            if seeds:
+                lines.append(f"round {number}: left out as unlike the others: seeds {seeds}")
             continue
         verdict = "settled" if tally.error <= rounds.tolerance else "not settled"
         line = (
             f"round {number}: {verdict} after {tally.painted} of at most {rounds.balls} balls, median within "
             f"{tally.error:.3f} for a tolerance of {rounds.tolerance:g}"
         )
-        seeds = ", ".join(map(str, tally.left_out))
         lines.append(f"{line}; left out as unlike the others: seeds {seeds}" if seeds else line)
     return lines

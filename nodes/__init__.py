@@ -17,6 +17,7 @@ from .inpaint import ChromeBallInpaint, IterativeMedian
 from .light_model import LightModel
 from .loaders import MiniProbeLoader
 from .photo_folder import LoadPhotoFolder
+from .quality import ProbeQuality
 from .speed_accuracy import SpeedAccuracyChart
 from .turbo import TurboLoRASwap
 
@@ -36,6 +37,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     BallToEquirect,
     EquirectToBall,
     ConfidenceMap,
+    ProbeQuality,
     LightModel,
     EstimateLight,
     BallGrid,

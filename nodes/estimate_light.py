@@ -50,6 +50,7 @@ from .painting import (
     model_input,
     network_inputs,
     one_picture,
+    reject_input,
     rounds_inputs,
     rounds_of,
     sampling_inputs,
@@ -125,6 +126,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                     tooltip="Seconds for painting: above 0 the best preset that is done in time takes the place of "
                     "the one above, by a short calibration that counts. 0: the preset above.",
                 ),
+                reject_input(),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -169,6 +171,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         until: float = 1.0,
         bracket: str = "fixed",
         budget: float = 0.0,
+        reject: bool = False,
         **options: Any,
     ) -> io.NodeOutput:
         """Steer one painter to each exposure, and estimate."""
@@ -177,9 +180,9 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         told = []
         if budget:
             pace_of = _bracket_painter(BarObserver(), clip, prompts, (0.0,), ev_min, options, finished=None)
-            choice = choose(budget, pace_of, canvas, diameter, _presets(values, tolerance, min_balls))
+            choice = choose(budget, pace_of, canvas, diameter, _presets(values, tolerance, min_balls, reject))
             preset, told = choice.name, [choice.line(budget)]
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until, reject)
         disc = _preset_disc(preset) if depth_disc == BY_PRESET else depth_disc
         place = (canvas, diameter, given(x), given(y), height, disc)
         settings = Settings(schedule, values, seed, merge, *place, bracket=bracket, darkest=ev_min)
@@ -200,10 +203,12 @@ def _confidence(probe: Probe) -> torch.Tensor:
     return probe.confidence.map[..., 0]
 
 
-def _presets(evs: tuple[float, ...], tolerance: float, min_balls: int) -> dict[str, Preset]:
+def _presets(evs: tuple[float, ...], tolerance: float, min_balls: int, reject: bool) -> dict[str, Preset]:
     """The presets as this node would run them."""
     return {
-        name: replace(row, evs=evs, rounds=replace(row.rounds, tolerance=tolerance or None, minimum=min_balls))
+        name: replace(
+            row, evs=evs, rounds=replace(row.rounds, tolerance=tolerance or None, minimum=min_balls, reject=reject)
+        )
         for name, row in PRESETS.items()
     }
 

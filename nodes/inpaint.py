@@ -28,6 +28,7 @@ from .painting import (
     model_input,
     network_inputs,
     one_picture,
+    reject_input,
     rounds_inputs,
     rounds_of,
     sampling_inputs,
@@ -165,6 +166,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 # Last, so that saved workflows keep the order of their widgets.
                 depth_model_input("Without one all rounds use depth."),
                 *settling_inputs(),
+                reject_input(),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -196,10 +198,11 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         tolerance: float = 0.0,
         min_balls: int = Rounds.minimum,
         until: float = 1.0,
+        reject: bool = False,
         **options: Any,
     ) -> io.NodeOutput:
         """Run Algorithm 1."""
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until, reject)
         request = _request(image, depth, ball, ev, (seed,))
         observer = BarObserver()
         painter = _painter(observer, ball, mask, options)

@@ -29,6 +29,7 @@ __all__ = [
     "model_input",
     "network_inputs",
     "one_picture",
+    "reject_input",
     "rounds_inputs",
     "rounds_of",
     "sampling_inputs",
@@ -148,6 +149,17 @@ def settling_inputs() -> list[Any]:
     ]
 
 
+def reject_input() -> Any:
+    """Whether balls unlike the others are left out of medians."""
+    return io.Boolean.Input(
+        "reject",
+        default=False,
+        optional=True,
+        tooltip="Leave balls that are unlike the others (faceted, matte, another scene) out of every median; the "
+        "report names their seeds. With a tolerance that is done in any case.",
+    )
+
+
 def sampling_inputs() -> list[Any]:
     """How every node that paints samples."""
     return [
@@ -224,6 +236,7 @@ def rounds_of(
     tolerance: float = 0.0,
     min_balls: int = Rounds.minimum,
     until: float = 1.0,
+    reject: bool = False,
 ) -> Rounds:
     """The schedule of a preset, or of the node's own values; with a tolerance above 0, until medians are settled.
 
@@ -231,7 +244,7 @@ def rounds_of(
         OptionError: an option out of range.
     """
     schedule = Rounds(balls, rounds, strength, steps, final, until) if name == CUSTOM else preset(name).rounds
-    return replace(schedule, tolerance=tolerance or None, minimum=min_balls)
+    return replace(schedule, tolerance=tolerance or None, minimum=min_balls, reject=reject)
 
 
 def guidance_of(options: dict[str, Any]) -> Guidance:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import pickle
+import subprocess
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
@@ -53,6 +55,44 @@ def test_an_error_in_a_worker_arrives_and_ends_the_others() -> None:
 def test_a_killed_worker_is_told_of() -> None:
     with pytest.raises(BrokenProcessPool):
         list(results_of(one_dies, [0, 1], 2))
+
+
+def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "from pathlib import Path\nimport os, time\nfrom dl_core.bench.workers import results_of\n"
+        "def slow(item):\n    Path(f'{item}.pid').write_text(str(os.getpid()))\n    time.sleep(300)\n    yield item\n"
+        "if __name__ == '__main__':\n    list(results_of(slow, ['a', 'b'], 2))\n"
+    )
+    root = Path(__file__).resolve().parent.parent
+    parent = subprocess.Popen([sys.executable, script], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(root)})
+    files = [tmp_path / f"{name}.pid" for name in "ab"]
+    try:
+        assert waited(lambda: all(file.exists() and file.read_text() for file in files), 120)
+    finally:
+        parent.kill()
+        parent.wait()
+    pids = [int(file.read_text()) for file in files]
+    assert waited(lambda: not any(is_running(pid) for pid in pids), 20)
+
+
+def waited(condition: Callable[[], bool], seconds: float) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    # One that ended and that nobody has asked for its status is still listed.
+    status = Path(f"/proc/{pid}/stat")
+    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,19 @@ from typing import Final
 
 import torch
 import torch.nn.functional as F
-from torch import Generator
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from ..ball import Ball, crop_ball, fit_canvas, paste_ball, place_ball
 from ..exposure import expose
 from ..geometry import latlong_to_ball
 from ..resize import resize_latlong
-from ..shapes import BallImage, Image, Latlong
+from ..shapes import BallImage, Latlong
 from .cameras import Shot
 
 __all__ = ["FAULTS", "Example", "examples"]
+
+Canvas = Float[Tensor, "b side side k"]
 
 CANVAS: Final = 256
 DIAMETER: Final = 64
@@ -40,7 +43,7 @@ class Example:
     """
 
     fault: str
-    canvas_ldr: Image
+    canvas_ldr: Canvas
     ball: Ball
 
     @property
@@ -53,9 +56,9 @@ def _drawn(generator: Generator, low: float, high: float) -> float:
     return low + (high - low) * float(torch.rand((), generator=generator))
 
 
-def _disco(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) -> Image:
+def _disco(light_hdr: Latlong, canvas: Canvas, ball: Ball, generator: Generator) -> Canvas:
     """Facets, each a mirror of a random tilt: it shows one place of the true ball."""
-    shown = expose(latlong_to_ball(light_hdr, ball.diameter, samples=4), 0.0)
+    shown = expose(latlong_to_ball(light_hdr, ball.diameter, samples=2), 0.0)
     size, facets = ball.diameter, round(_drawn(generator, 5, 10))
     cell = (torch.arange(size) * facets / size).long()
     tilt = torch.randn(facets, facets, 2, generator=generator) * size / 6
@@ -65,15 +68,15 @@ def _disco(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) 
     return paste_ball(canvas, shown[:, rows[cell][:, cell], columns[cell][:, cell]], ball)
 
 
-def _matte(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) -> Image:
+def _matte(light_hdr: Latlong, canvas: Canvas, ball: Ball, generator: Generator) -> Canvas:
     """A rough ball: it shows means over cones some 40 to 80 degrees wide."""
-    shown = latlong_to_ball(light_hdr, ball.diameter, samples=4)
+    shown = latlong_to_ball(light_hdr, ball.diameter, samples=2)
     width = round(_drawn(generator, 0.2, 0.4) * ball.diameter) // 2 * 2 + 1
     padded = F.pad(shown.permute(0, 3, 1, 2), [width // 2] * 4, mode="replicate")
     return paste_ball(canvas, expose(F.avg_pool2d(padded, width, stride=1).permute(0, 2, 3, 1), 0.0), ball)
 
 
-def _off_centre(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) -> Image:
+def _off_centre(light_hdr: Latlong, canvas: Canvas, ball: Ball, generator: Generator) -> Canvas:
     """A good ball an eighth to a third of its width beside its place."""
     turn, away = _drawn(generator, 0, 2 * math.pi), _drawn(generator, 0.125, 0.33) * ball.diameter
     x, y = (c + round(away * f(turn)) for c, f in zip(ball.centre, (math.cos, math.sin), strict=True))
@@ -81,7 +84,7 @@ def _off_centre(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Genera
     return _good(light_hdr, canvas, elsewhere, generator)
 
 
-def _partial(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) -> Image:
+def _partial(light_hdr: Latlong, canvas: Canvas, ball: Ball, generator: Generator) -> Canvas:
     """A good ball of which a fifth to a half is missing on one side."""
     painted = _good(light_hdr, canvas, ball, generator)
     place = torch.arange(ball.canvas) + 0.5
@@ -91,17 +94,17 @@ def _partial(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator
     return torch.where(beyond[None, ..., None], canvas, painted)
 
 
-def _tinted(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) -> Image:
+def _tinted(light_hdr: Latlong, canvas: Canvas, ball: Ball, generator: Generator) -> Canvas:
     """Coloured metal, such as gold or blue steel."""
     tint = torch.exp(0.5 * torch.randn(3, generator=generator) - 0.2)
     return _good(light_hdr * tint, canvas, ball, generator)
 
 
-def _good(light_hdr: Latlong, canvas: Image, ball: Ball, generator: Generator) -> Image:
-    return paste_ball(canvas, expose(latlong_to_ball(light_hdr, ball.diameter, samples=4), 0.0), ball)
+def _good(light_hdr: Latlong, canvas: Canvas, ball: Ball, generator: Generator) -> Canvas:
+    return paste_ball(canvas, expose(latlong_to_ball(light_hdr, ball.diameter, samples=2), 0.0), ball)
 
 
-Draw = Callable[[Latlong, Image, Ball, Generator], Image]
+Draw = Callable[[Latlong, Canvas, Ball, Generator], Canvas]
 
 FAULTS: Final[dict[str, Draw]] = {
     "disco": _disco,
@@ -122,7 +125,7 @@ def examples(shot: Shot, seed: int) -> Iterator[Example]:
         yield Example(fault, _finished(draw(light, canvas, ball, generator), generator), ball)
 
 
-def _finished(canvas: Image, generator: Generator) -> Image:
+def _finished(canvas: Canvas, generator: Generator) -> Canvas:
     """As painters leave it: with noise, and half of the time a little soft."""
     if _drawn(generator, 0, 1) < 0.5:
         padded = F.pad(canvas.permute(0, 3, 1, 2), (1, 1, 1, 1), mode="replicate")

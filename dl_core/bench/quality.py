@@ -208,7 +208,7 @@ def _range(values: Sequence[float], limit: float) -> Range:
 def _summary(rows: Sequence[Row], painter: str | None) -> list[Row]:
     good = [row for row in rows if row["ball"] == GOOD]
     summary: list[Row] = []
-    kinds = {fault: (fault,) for fault in FAULTS}
+    kinds: dict[str, tuple[str, ...]] = {fault: (fault,) for fault in FAULTS}
     kinds |= {"all but tinted": tuple(fault for fault in FAULTS if fault not in SCENE_FAULTS), "all": tuple(FAULTS)}
     for name, faults in kinds.items():
         bad = [row for row in rows if row["ball"] in faults]

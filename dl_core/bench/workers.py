@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from queue import Empty
+from threading import Thread
 from typing import Any, Final, TypeVar
 
 import torch
@@ -53,43 +54,59 @@ def results_of(task: Callable[[Item], Iterable[Result]], items: Sequence[Item], 
             yield from task(item)
         return
     context = get_context("spawn")  # a fork would copy torch's threads in whatever state they are
-    with context.Manager() as manager:
-        results, stop = manager.Queue(), manager.Event()
-        with ProcessPoolExecutor(workers, context, initializer=_share_processors, initargs=(workers,)) as pool:
-            running = {pool.submit(_send, task, item, results, stop) for item in items}
-            try:
-                yield from _heard(running, results)
-            finally:
-                stop.set()
-                pool.shutdown(cancel_futures=True)
-
-
-def _heard(running: set[Future[None]], results: Any) -> Iterator[Any]:
-    """What comes through a manager's queue until all work is done."""
-    while running:
-        done, running = wait(running, timeout=PATIENCE, return_when=FIRST_COMPLETED)
-        yield from _arrived(results)
-        for future in done:
-            future.result()
-
-
-def _arrived(results: Any) -> Iterator[Any]:
-    while True:
+    results, stop = context.Queue(), context.Event()
+    setup = (workers, results, stop)
+    with ProcessPoolExecutor(workers, context, initializer=_set_up, initargs=setup) as pool:
+        running = {pool.submit(_send, task, item) for item in items}
         try:
-            yield results.get_nowait()
+            yield from _heard(running, results)
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def _heard(running: set[Future[int]], results: Any) -> Iterator[Any]:
+    """What comes through a queue until all work is done, and as much has come as was sent."""
+    sent, come = 0, 0
+    while running or come < sent:
+        done, running = wait(running, timeout=0 if come < sent else PATIENCE, return_when=FIRST_COMPLETED)
+        sent += sum(future.result() for future in done)
+        try:
+            while True:
+                yield results.get(timeout=PATIENCE if come < sent else 0.001)
+                come += 1
         except Empty:
-            return
+            continue
 
 
-def _send(task: Callable[[Item], Iterable[Any]], item: Item, results: Any, stop: Any) -> None:
-    """In a worker: send an item's results on, until there are no more or nobody wants them."""
+_mailbox: Any = None
+"""In a worker: where results go, and whether anybody still wants them."""
+
+
+def _send(task: Callable[[Item], Iterable[Any]], item: Item) -> int:
+    """In a worker: send an item's results on, until there are no more or nobody wants them; how many there were."""
+    results, stop = _mailbox
+    count = 0
     if stop.is_set():
-        return
+        return count
     for result in task(item):
         results.put(result)
+        count += 1
         if stop.is_set():
-            return
+            break
+    return count
 
 
-def _share_processors(workers: int) -> None:
+def _set_up(workers: int, results: Any, stop: Any) -> None:
+    """In a worker, before its first item: take a share of the processors, and end when the parent is killed."""
+    global _mailbox
+    _mailbox = (results, stop)
     torch.set_num_threads(max(1, torch.get_num_threads() // workers))
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> None:
 def _preset(args: argparse.Namespace, name: str) -> Preset:
     """A preset with what the command line replaces of it."""
     chosen = preset(name)
-    rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls)
+    rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls, reject=args.reject)
     return replace(chosen, rounds=rounds, evs=chosen.evs if args.evs is None else _parse_evs(args.evs))
 
 

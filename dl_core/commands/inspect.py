@@ -1,4 +1,7 @@
-"""`lightprobe inspect FILE`: what an environment map says about itself, and how much light it holds."""
+"""`lightprobe inspect FILE`: what an environment map says about itself, and whether it is of a good mirror ball.
+
+The picture of a ball is judged likewise.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,19 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import OptionError
+
 if TYPE_CHECKING:
+    from ..quality.inspection import Inspection
     from ..shapes import Latlong
 
-__all__ = ["add_arguments", "describe", "run"]
+__all__ = ["add_arguments", "describe", "inspect", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `inspect`."""
-    parser.add_argument("file", metavar="FILE", help="environment map: EXR or Radiance .hdr")
+    parser.add_argument("file", metavar="FILE", help="environment map (EXR, Radiance .hdr), or the picture of a ball")
+    parser.add_argument("--ball", metavar="X,Y,DIAMETER", help="the ball in a picture of more than it, in pixels")
     parser.add_argument("--json", action="store_true", help="print it as JSON")
 
 
@@ -24,15 +31,45 @@ def run(args: argparse.Namespace) -> None:
     """Print the description.
 
     Raises:
-        ImageError: a file that is no environment map.
+        ImageError: a file that is neither a map nor the picture of a ball.
+        OptionError: a place of the ball that is none, or one for a map.
     """
-    facts = describe(Path(args.file))
+    facts, found = inspect(Path(args.file), args.ball)
     if args.json:
-        print(json.dumps(facts, indent=2))
+        print(json.dumps(facts | found.document(), indent=2))
         return
     width = max(len(name) for name in facts)
     for name, value in facts.items():
         print(f"{name:{width}}  {_text(value)}")
+    print(f"\nscore {found.score:.2f} of 1 as a mirror ball")
+    for check in found.checks:
+        print(check.line())
+    for note in found.notes:
+        print(f"      {note}")
+
+
+def inspect(path: Path, ball: str | None = None) -> tuple[dict[str, Any], Inspection]:
+    """Facts about a file by name, and what was found of its ball.
+
+    Args:
+        path: of the file.
+        ball: `X,Y,DIAMETER` of the ball in a picture of more than it.
+
+    Raises:
+        ImageError: a file that is neither a map nor the picture of a ball.
+        OptionError: a place of the ball that is none, or one for a map.
+    """
+    from ..imageio import is_envmap, read_envmap, read_photograph
+    from ..quality.inspection import inspect_map, inspect_picture, parse_ball
+
+    if is_envmap(path):
+        if ball is not None:
+            raise OptionError("--ball", ball, "nothing with an environment map")
+        return describe(path), inspect_map(read_envmap(path))
+    picture = read_photograph(path)
+    height, width = picture.shape[1:3]
+    place = None if ball is None else parse_ball(ball, width, height)
+    return {"format": "picture", "size": f"{width} x {height}"}, inspect_picture(picture, place)
 
 
 def _text(value: Any) -> str:

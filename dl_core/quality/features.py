@@ -32,7 +32,7 @@ from torch import Tensor
 
 from ..errors import ImageError
 from ..exposure import decode_display, luminance
-from ..shapes import BallImage
+from ..shapes import BallImage, Image
 
 __all__ = ["SIDE", "BallFeatures", "ball_features"]
 
@@ -109,7 +109,7 @@ def _disc() -> _Disc:
     return _Disc(x, y, inside, sector)
 
 
-def ball_features(ball_ldr: BallImage) -> BallFeatures:
+def ball_features(ball_ldr: Image) -> BallFeatures:
     """Measure a ball.
 
     Args:
@@ -210,11 +210,11 @@ def _strength(grey: Float[Tensor, "d d"], width: int, disc: _Disc) -> float:
 
 
 def _mean(grey: Float[Tensor, "d d"], width: int, disc: _Disc) -> Float[Tensor, "d d"]:
-    """Means over boxes, of the disc alone."""
+    """Means over boxes of the disc alone; of odd width, so that they have a middle."""
     if width == 1:
         return grey
     both = torch.stack((grey * disc.inside, disc.inside))[None]
-    sums = F.avg_pool2d(F.pad(both, (width // 2, (width - 1) // 2) * 2), width, stride=1)[0]
+    sums = F.avg_pool2d(both, width | 1, stride=1, padding=width // 2)[0]
     return sums[0] / sums[1].clamp(min=1e-6)
 
 

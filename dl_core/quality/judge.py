@@ -59,6 +59,10 @@ class Check:
         """As JSON has it."""
         return asdict(self)
 
+    def line(self) -> str:
+        """One line for people."""
+        return f"{self.score:.2f}  {self.name:10}  {self.message}. {self.suggestion}".rstrip()
+
 
 @dataclass(frozen=True)
 class Kind:

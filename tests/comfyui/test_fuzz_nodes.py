@@ -38,7 +38,12 @@ MOST = {
     "batch_size": 2,
 }
 """Largest values of widgets that would only cost time."""
-LISTS = {"HDRMerge": ("balls", "ev"), "ConfidenceMap": ("balls", "ev"), "FitBall": ("balls",)}
+LISTS = {
+    "HDRMerge": ("balls", "ev"),
+    "ConfidenceMap": ("balls", "ev"),
+    "ProbeQuality": ("balls",),
+    "FitBall": ("balls",),
+}
 SHAPES = (
     (1, 48, 64, 3),
     (1, 64, 64, 3),

@@ -30,6 +30,7 @@ SOCKETS = {
     "BallToEquirect": ("image ball fit", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),
     "ConfidenceMap": ("balls ev latlong", "confidence picture expected_error report"),
+    "ProbeQuality": ("balls ev composite ball photograph", "score report json"),
     "LightModel": ("latlong", "latlong report picture"),
     "EstimateLight": (
         "model clip vae control_net image depth depth_model",
