@@ -235,7 +235,9 @@ def test_what_the_painter_notes_is_reported_by_exposure(
     assert run(photo, out) == 0
     assert "EV 0: out of memory with 4 balls at once: went on with 2\n" in capsys.readouterr().out
     assert run(photo, out, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["notes"] == ["EV 0: out of memory with 4 balls at once: went on with 2"]
+    first, *others = json.loads(capsys.readouterr().out)["notes"]
+    assert first == "EV 0: out of memory with 4 balls at once: went on with 2"
+    assert not any("memory" in note for note in others)
 
 
 @pytest.mark.parametrize(
@@ -451,7 +453,7 @@ def test_inspect_radiance_and_what_is_no_map(tmp_path: Path, capsys: pytest.Capt
     assert "Radiance RGBE" in capsys.readouterr().out
     (tmp_path / "a.txt").write_text("no map")
     assert cli.main(["inspect", str(tmp_path / "a.txt")]) == 1
-    assert "neither an EXR nor a Radiance" in capsys.readouterr().err
+    assert "cannot be read as a photograph" in capsys.readouterr().err
 
 
 # --- the command line itself ---
