@@ -137,7 +137,9 @@ class Confidence:
     def line(self) -> str:
         """One sentence for people."""
         held = self.calibration.correlation
-        ranked = "" if held is None else f"; rank correlation with the true error {held:.2f} on others"
+        ranked = (
+            "" if held is None else f"; over other photographs its rank correlation with the true error is {held:.2f}"
+        )
         return (
             f"expected error {self.expected_error:.2f} stops (spread of {self.balls} balls; calibrated on "
             f"{self.calibration.measured_on}{ranked})"

@@ -45,7 +45,7 @@ def forget() -> None:
 
 
 def whole(node: Nodes, graph: Any, **changes: Any) -> Any:
-    """Outputs of EstimateLight: latlong, hdr, composite, balls, ball, report."""
+    """Outputs of EstimateLight: latlong, hdr, composite, balls, ball, report, confidence."""
     networks = {name: getattr(graph, name) for name in ("model", "clip", "vae", "control_net")}
     options = {**PROMPTS, "negative_prompt": "matte", **EVS, **ROUNDS, **SAMPLING, **PLACE, "height": 32}
     return node("EstimateLight").execute(**{**networks, "image": PHOTO, "merge": "robust", **options, **changes}).args
@@ -72,7 +72,8 @@ def single_nodes(
     balls, reports = [item[0] for item in painted], [item[4] for item in painted]
     hdr, report = node("HDRMerge").execute(balls, evs, [merge], [2.4], reports).args
     latlong, _ = node("BallToEquirect").execute(hdr, height=32, yaw=0.0, samples=1).args
-    return latlong, hdr, painted[0][3], torch.cat(balls), ball, report
+    trusted, _, _, line = node("ConfidenceMap").execute([item[5] for item in painted], evs, [latlong]).args
+    return latlong, hdr, painted[0][3], torch.cat(balls), ball, report, trusted, line
 
 
 def without_times(report: str) -> str:
@@ -106,7 +107,9 @@ def test_pictures_are_those_of_the_single_nodes(node: Nodes, graph: Any, changes
     for one, other in zip(ours[:4], theirs[:4], strict=True):
         assert torch.equal(one, other)
     assert ours[4] == theirs[4]
-    assert without_times(ours[5]) == without_times(theirs[5])
+    assert theirs[7] in ours[5].splitlines()
+    assert without_times(ours[5].replace(theirs[7] + "\n", "")) == without_times(theirs[5])
+    assert torch.equal(ours[6], theirs[6])
     # Equal pictures say nothing unless they differ from each other and from the photograph's.
     balls = ours[3]
     assert all((a - b).abs().max() > 1e-3 for a, b in ((balls[0], balls[1]), (balls[1], balls[2])))
