@@ -28,7 +28,9 @@ class Untrained:
     def model(self) -> MiniModel:
         with torch.random.fork_rng():
             torch.manual_seed(self.seed)
-            return MiniModel.untrained()
+            model = MiniModel.untrained()
+        # Random networks paint black with little guidance.
+        return replace(model, defaults=replace(model.defaults, guidance=1.5))
 
     def base(self) -> LoraBase:
         return LoraBase.from_mini(self.model())

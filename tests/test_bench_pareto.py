@@ -197,7 +197,8 @@ def test_two_workers_measure_what_one_does(
     one = report_of(capsys, *options)
     two = report_of(capsys, *options, "--workers", "2", "--out", str(tmp_path / "out"))
     for mine, theirs in zip(two["rows"], one["rows"], strict=True):
-        assert {**mine, "seconds": None} == {**theirs, "seconds": None}
+        # Threads, of which a worker has fewer, change the order of sums.
+        assert {**mine, "seconds": None} == pytest.approx({**theirs, "seconds": None}, rel=1e-9)
     assert len((tmp_path / "out" / "rows.jsonl").read_text().splitlines()) == 1 + 2 * 2
 
 
