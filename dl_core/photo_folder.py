@@ -37,9 +37,9 @@ def folder_files(folder: str | Path) -> tuple[Path, ...]:
         ImageError: no such folder, one that cannot be read, or one without files.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise ImageError(folder, "is no folder" if folder.exists() else "there is no such folder")
     try:
+        if not folder.is_dir():
+            raise ImageError(folder, "is no folder" if folder.exists() else "there is no such folder")
         files = [path for path in folder.iterdir() if path.is_file()]
     except OSError as error:
         raise ImageError(folder, f"cannot be read ({error.strerror or error})") from error

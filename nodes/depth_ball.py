@@ -20,7 +20,7 @@ from ..dl_core.ball import (
     unfit_canvas,
 )
 from ..dl_core.estimate import check_photograph
-from .sockets import CATEGORY, BallSocket, as_rgb, named_output
+from .sockets import CATEGORY, BallSocket, as_finite_rgb, as_rgb, named_output
 
 __all__ = ["AUTOMATIC", "CanvasToImage", "DepthBallMask", "depth_input", "given", "place_inputs", "size_inputs"]
 
@@ -176,7 +176,7 @@ class CanvasToImage(io.ComfyNode):  # type: ignore[misc]
     def execute(cls, canvas_image: torch.Tensor, image: torch.Tensor, ball: Ball) -> io.NodeOutput:
         """Cut, resize, paste."""
         photo = check_photograph(as_rgb(image, "image"))
-        composite = require_canvas(as_rgb(canvas_image, "canvas_image"), ball)
+        composite = require_canvas(as_finite_rgb(canvas_image, "canvas_image"), ball)
         height, width = photo.shape[1:3]
         pasted = paste_on_photograph(photo, composite, ball)
         return io.NodeOutput(pasted, unfit_canvas(composite, height, width), photograph_disc(ball, height, width))

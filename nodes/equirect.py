@@ -12,7 +12,7 @@ from ..dl_core.ball_fit import BallFit
 from ..dl_core.errors import ImageError, OptionError
 from ..dl_core.geometry import ball_to_latlong, camera_rotation, latlong_coverage, latlong_to_ball, rotate_latlong
 from ..dl_core.projection import PROJECTIONS
-from .sockets import CATEGORY, BallFitSocket, BallSocket, as_rgb, named_output
+from .sockets import CATEGORY, BallFitSocket, BallSocket, as_finite_rgb, as_rgb, named_output
 
 __all__ = ["BallToEquirect", "EquirectToBall", "camera_inputs"]
 
@@ -132,7 +132,7 @@ class BallToEquirect(io.ComfyNode):  # type: ignore[misc]
         inset: float = 0.0,
     ) -> io.NodeOutput:
         """Cut out, unwrap, turn."""
-        crop = _cut_out(as_rgb(image, "image"), ball)
+        crop = _cut_out(as_finite_rgb(image, "image"), ball)
         size = crop.shape[1]
         circle = _circle(fit, ball, size / 2 - inset)
         camera = PROJECTIONS[projection](fov, *_picture(size, frame, ball))

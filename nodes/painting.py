@@ -17,7 +17,7 @@ from ..dl_core.shapes import Image, Mask
 from .painter import ComfyPainter, Guidance, Networks
 from .progress import BarObserver
 from .sampling import SAMPLERS, SCHEDULERS
-from .sockets import DepthModelSocket, as_rgb
+from .sockets import DepthModelSocket, as_finite_rgb
 
 __all__ = [
     "CUSTOM",
@@ -262,11 +262,9 @@ def one_picture(image: torch.Tensor, socket: str) -> Image:
     Raises:
         ImageError: another layout, more than one picture, or values that are not finite; the socket is named.
     """
-    picture = as_rgb(image, socket)
+    picture = as_finite_rgb(image, socket)
     if len(picture) != 1:
         raise ImageError(socket, f"holds {len(picture)} pictures; one is accepted")
-    if not torch.isfinite(picture).all():
-        raise ImageError(socket, "holds NaN or infinite values")
     return picture
 
 

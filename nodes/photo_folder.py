@@ -85,7 +85,10 @@ def _path(folder: str) -> Path:
     """
     inputs = Path(folder_paths.get_input_directory()).resolve()
     name = folder.strip()
-    path = (inputs / name).resolve()
+    try:
+        path = (inputs / name).resolve()
+    except (OSError, ValueError) as error:  # no file system takes such a name
+        raise OptionError("folder", folder, "the name of a folder") from error
     if not name or not (Path(name).is_absolute() or path.is_relative_to(inputs)):
         raise OptionError("folder", folder, f"a folder inside ComfyUI's input folder {inputs}, or an absolute path")
     return path

@@ -18,6 +18,7 @@ __all__ = [
     "BallFitSocket",
     "BallSocket",
     "DepthModelSocket",
+    "as_finite_rgb",
     "as_rgb",
     "named_output",
     "parse_evs",
@@ -50,6 +51,18 @@ def as_rgb(image: torch.Tensor, socket: str) -> torch.Tensor:
     if image.ndim != 4 or image.shape[-1] not in (1, 3, 4):
         raise ImageError(socket, f"has shape {tuple(image.shape)}; (batch, height, width, 1, 3 or 4) is accepted")
     return image.expand(-1, -1, -1, 3) if image.shape[-1] == 1 else image[..., :3]
+
+
+def as_finite_rgb(image: torch.Tensor, socket: str) -> torch.Tensor:
+    """As `as_rgb`, of pictures without NaN and infinity.
+
+    Raises:
+        ImageError: another layout, or values that are not finite; `socket` is named.
+    """
+    picture = as_rgb(image, socket)
+    if not torch.isfinite(picture).all():
+        raise ImageError(socket, "holds NaN or infinite values")
+    return picture
 
 
 def parse_evs(text: str) -> tuple[float, ...]:
