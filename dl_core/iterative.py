@@ -239,17 +239,23 @@ def _settle(
         heard(balls)
         if rounds.tolerance is None:
             break
-        strange = find_outliers(balls, disc)
-        kept = balls[~strange]
+        kept, left_out = _alike(balls, disc, seed)
         weight = disc if used is None else disc * used[0].to(disc)
         error = error_bound(kept, weight, 1 - (1 - CONFIDENCE) / len(rounds.counts))
         if error <= rounds.tolerance or wanted == rounds.balls:
-            left_out = tuple(seed + j for j in strange.nonzero()[:, 0].tolist())
             return kept, Tally(count, left_out, error)
     if not rounds.reject:
         return balls, Tally(count)
+    kept, left_out = _alike(balls, disc, seed)
+    return kept, Tally(count, left_out)
+
+
+def _alike(
+    balls: BallImage, disc: Float[Tensor, "d d"], seed: int
+) -> tuple[Float[Tensor, "kept d d c"], tuple[int, ...]]:
+    """The balls that are like the others, and the seeds of those that are not, the first one's being `seed`."""
     strange = find_outliers(balls, disc)
-    return balls[~strange], Tally(count, tuple(seed + j for j in strange.nonzero()[:, 0].tolist()))
+    return balls[~strange], tuple(seed + j for j in strange.nonzero()[:, 0].tolist())
 
 
 def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[Image], Image] | None) -> PaintRequest:

@@ -14,7 +14,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -33,7 +33,7 @@ from dl_core.queueing.ledger import Ledger
 from dl_core.queueing.pool import Job, Outcome, SilentWatcher
 from dl_core.queueing.workflow import Workflow, read_workflow
 
-__all__ = ["Trial", "Verdict", "judge", "listed", "put_to_trial"]
+__all__ = ["GROWTH", "SMOOTH", "WARM", "Trial", "Verdict", "judge", "listed", "put_to_trial", "warm_and_end"]
 
 WARM: Final = 20
 """Jobs after which a server has loaded and allocated what it needs."""
@@ -98,13 +98,19 @@ class Verdict:
     @property
     def growth(self) -> float | None:
         """By how much memory grew after the first jobs of the last server; None where it had too few."""
-        if len(self.resident) < WARM + SMOOTH:
-            return None
-        return median(self.resident[-SMOOTH:]) / median(self.resident[WARM - SMOOTH : WARM]) - 1
+        levels = warm_and_end(self.resident)
+        return None if levels is None else levels[1] / levels[0] - 1
 
     def document(self) -> dict[str, Any]:
         """As JSON has it."""
         return asdict(self) | {"growth": self.growth}
+
+
+def warm_and_end(resident: Sequence[int]) -> tuple[float, float] | None:
+    """Bytes once a server is warm and at the end, each a median of a few readings; None where there are too few."""
+    if len(resident) < WARM + SMOOTH:
+        return None
+    return median(resident[WARM - SMOOTH : WARM]), median(resident[-SMOOTH:])
 
 
 class _Running:

@@ -16,7 +16,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -39,9 +38,9 @@ from ..resize import resize_latlong
 from ..shapes import Latlong
 from .cameras import random_camera, take
 from .journal import Journal
-from .painters import PAINTERS, Studio, add_files, identity, open_studio
+from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from .paintings import VARIANTS
-from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, split_files
+from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 from .workers import check_workers, results_of
 
 __all__ = ["add_arguments", "fit_weights", "held_by_least_trusted", "log_error", "rank_correlation", "run"]
@@ -85,10 +84,12 @@ def run(args: argparse.Namespace) -> None:
         raise OptionError("--calibration", str(args.calibration), "nothing beside --calibrate: it makes one")
     check_workers(args.workers)
     chosen = preset(args.preset)
-    files = panorama_files(args.panoramas) if args.split is None else split_files(args.panoramas, args.split)
+    files = panorama_files(args.panoramas, args.split)
     if args.calibrate is not None:
         require_writable(args.calibrate)
-    calibration = shipped_calibration() if args.calibration is None else Calibration.read(args.calibration)
+    calibration = None
+    if args.calibrate is None:
+        calibration = shipped_calibration() if args.calibration is None else Calibration.read(args.calibration)
     prepare_output(args)
     models = ModelFiles.of(args)
     studio = open_studio(args.painter, models)
@@ -101,21 +102,22 @@ def run(args: argparse.Namespace) -> None:
         "seed": args.seed,
     }
     journal = Journal(args.out, run_identity, args.cameras)
-    asked = _Asked(
-        Settings(chosen.rounds, chosen.evs, args.seed, canvas=studio.canvas, diameter=studio.diameter, height=4 * ROWS),
-        args.cameras,
+    settings = Settings(
+        rounds=chosen.rounds,
+        evs=chosen.evs,
+        seed=args.seed,
+        canvas=studio.canvas,
+        diameter=studio.diameter,
+        height=4 * ROWS,
     )
-    task = partial(
-        _measure_panorama,
-        studio_of=(lambda: studio) if args.workers == 1 else partial(open_studio, args.painter, models),
-        asked=asked,
-    )
+    studio_of = studio_for_workers(args.workers, studio, args.painter, models)
+    task = partial(_measure_panorama, studio_of=studio_of, settings=settings, cameras=args.cameras)
     wanted = [path for path in files if not journal.has(path.stem)]
     for rows in results_of(task, wanted, args.workers):
         journal.add(rows)
         sys.stderr.write(f"{rows[0]['panorama']}: {len(rows)} photographs\n")
     measured = sorted(journal.rows, key=lambda row: (row["panorama"], row["camera"]))
-    if args.calibrate is not None:
+    if calibration is None:
         calibration = _calibrate(measured, args)
     rows = [_judged(row, calibration) for row in measured]
     summary = _summary(rows)
@@ -133,21 +135,15 @@ def run(args: argparse.Namespace) -> None:
     publish(report, args, rows=_ROWS, summary=_SUMMARY)
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """What is estimated of every panorama."""
-
-    settings: Settings
-    cameras: int
-
-
-def _measure_panorama(path: Path, studio_of: Callable[[], Studio], asked: _Asked) -> Iterator[list[Row]]:
+def _measure_panorama(
+    path: Path, studio_of: Callable[[], Studio], settings: Settings, cameras: int
+) -> Iterator[list[Row]]:
     """Rows of all photographs of a panorama, with the evidence and the error of every direction."""
     studio, panorama, rows = studio_of(), read_envmap(path), list[Row]()
-    for number in range(asked.cameras):
-        camera = random_camera(f"{path.stem}/{number}", asked.settings.seed)
+    for number in range(cameras):
+        camera = random_camera(f"{path.stem}/{number}", settings.seed)
         shot = take(panorama, camera)
-        probe = estimate(shot.photo_ldr, studio.painter_of(STEERED, shot), asked.settings)
+        probe = estimate(shot.photo_ldr, studio.painter_of(STEERED, shot), settings)
         spread = bracket_spread([exposure.balls for exposure in probe.exposures], probe.evs)
         small = resize_latlong(probe.latlong_hdr, ROWS)
         error = log_error(small, resize_latlong(shot.truth_hdr, ROWS))

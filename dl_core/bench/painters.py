@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Final
 
 from ..backends.loading import BACKENDS, LoadedPainter, ModelFiles
@@ -16,7 +16,7 @@ from .journal import fingerprint
 from .paintings import PainterOf, Variant
 from .perfect import PerfectPainter
 
-__all__ = ["PAINTERS", "Studio", "add_files", "identity", "open_studio"]
+__all__ = ["PAINTERS", "Studio", "add_files", "identity", "open_studio", "studio_for_workers"]
 
 _FILES: Final = {
     "model": "checkpoint",
@@ -89,3 +89,15 @@ def open_studio(name: str, files: ModelFiles) -> Studio:
     if name not in PAINTERS:
         raise OptionError("--painter", name, ", ".join(PAINTERS))
     return PAINTERS[name](files)
+
+
+def studio_for_workers(workers: int, studio: Studio, name: str, files: ModelFiles) -> Callable[[], Studio]:
+    """What gives each panorama its studio: one worker has it open, several, being other processes, open their own.
+
+    Args:
+        workers: processes, as `workers.results_of` takes them.
+        studio: of the name and the files.
+        name: of `PAINTERS`.
+        files: of the painter.
+    """
+    return (lambda: studio) if workers == 1 else partial(open_studio, name, files)

@@ -35,7 +35,7 @@ from .bootstrap import LEVEL, Interval, mean_interval
 from .cameras import Camera, Shot, take
 from .front import on_front
 from .journal import Journal
-from .painters import PAINTERS, Studio, add_files, identity, open_studio
+from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from .paintings import VARIANTS
 from .pareto_files import FIGURES, write_files
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
     journal = Journal(args.out, run_identity, unit=("panorama", "schedule"))
     bench_pareto(
         files,
-        (lambda: studio) if args.workers == 1 else partial(open_studio, args.painter, models),
+        studio_for_workers(args.workers, studio, args.painter, models),
         schedules,
         journal,
         convention=args.convention,

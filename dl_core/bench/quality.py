@@ -28,13 +28,13 @@ from ..estimate import Settings, estimate
 from ..imageio import atomic, read_envmap, require_writable
 from ..presets import preset
 from ..quality.features import BallFeatures, ball_features
-from ..quality.judge import CHECKS, OVERALL, Judge, Logistic, Range, shipped_judge
+from ..quality.judge import CHECKS, DOUBT, Judge, Logistic, Range, shipped_judge, worst_of
 from ..quality.surroundings import contrast_of, exposures_check, rim_difference
 from .cameras import Camera, Shot, random_camera, take
 from .faulty_balls import FAULTS, examples
 from .painters import PAINTERS, add_files, open_studio
 from .paintings import VARIANTS
-from .report import Column, Report, Row, add_output, panorama_files, prepare_output, publish, split_files
+from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 
 __all__ = ["add_arguments", "auc", "fit_logistic", "run"]
 
@@ -46,8 +46,8 @@ SCENE_FAULTS: Final = ("tinted",)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
+    add_panoramas(parser)
     add = parser.add_argument
-    add("--panoramas", type=Path, required=True, metavar="DIR", help="folder of EXR or HDR maps")
     add("--split", help="only maps of this split of the folder's manifest.json")
     add("--cameras", type=int, default=6, help="photographs of each panorama, drawn at random (default: 6)")
     add("--calibrate", type=Path, metavar="FILE", help="fit the checks to these balls and write them")
@@ -71,12 +71,13 @@ def run(args: argparse.Namespace) -> None:
         raise OptionError("--cameras", args.cameras, "1 or more")
     if args.calibrate is not None and args.judge is not None:
         raise OptionError("--judge", str(args.judge), "nothing beside --calibrate: it makes one")
-    files = panorama_files(args.panoramas) if args.split is None else split_files(args.panoramas, args.split)
+    files = panorama_files(args.panoramas, args.split)
     if args.calibrate is not None:
         require_writable(args.calibrate)
     prepare_output(args)
-    judge = shipped_judge() if args.judge is None and args.calibrate is None else None
-    judge = Judge.read(args.judge) if args.judge is not None else judge
+    judge = None
+    if args.calibrate is None:
+        judge = shipped_judge() if args.judge is None else Judge.read(args.judge)
     chosen = preset(args.preset)
     shots = [(path.stem, camera, shot) for path in files for camera, shot in _shots(path, args.cameras, args.seed)]
     rows = [row for index, (stem, camera, shot) in enumerate(shots) for row in _measured(stem, camera, shot, index)]
@@ -129,8 +130,8 @@ def _row(stem: str, camera: Camera, kind: str, features: BallFeatures, **more: f
 
 
 def _judged(row: Row, judge: Judge) -> Row:
-    checks = {name: logistic(row) for name, logistic in judge.checks.items()}
-    return {**row, "score": min(checks[name] for name in OVERALL), **{f"{name}_score": checks[name] for name in checks}}
+    scores = judge.scores(row)
+    return {**row, "score": worst_of(scores), **{f"{name}_score": score for name, score in scores.items()}}
 
 
 # --- fitting -----------------------------------------------------------------------------------------------------
@@ -233,8 +234,8 @@ def _summary(rows: Sequence[Row], painter: str | None) -> list[Row]:
                 "balls": kind,
                 "count": len(own),
                 "score_mean": fmean(row["score"] for row in own),
-                "passed": sum(row["score"] >= 0.5 for row in own) / len(own),
-                **{f"{name}_passed": sum(row[f"{name}_score"] >= 0.5 for row in own) / len(own) for name in CHECKS},
+                "passed": sum(row["score"] >= DOUBT for row in own) / len(own),
+                **{f"{name}_passed": sum(row[f"{name}_score"] >= DOUBT for row in own) / len(own) for name in CHECKS},
             }
         )
     return [{key: row.get(key) for key in dict.fromkeys(k for r in summary for k in r)} for row in summary]

@@ -37,7 +37,6 @@ __all__ = [
     "panorama_files",
     "prepare_output",
     "publish",
-    "split_files",
     "summarize_groups",
     "table",
 ]
@@ -102,28 +101,25 @@ def add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the report as JSON instead of tables")
 
 
-def panorama_files(folder: Path) -> list[Path]:
+def panorama_files(folder: Path, split: str | None = None) -> list[Path]:
     """The maps in a folder, by name.
 
+    Args:
+        folder: holds them.
+        split: of the folder's manifest.json, to whose maps to keep; all maps of the folder when not given.
+
     Raises:
-        OptionError: no such folder, or no map in it.
+        OptionError: no such folder, or no map in it; no manifest, or no such split.
     """
+    if split is not None:
+        from ..training.panoramas import panorama_files as files_of_split
+
+        return sorted(files_of_split(folder, split))
     there = folder.iterdir() if folder.is_dir() else ()
     files = sorted(path for path in there if path.suffix.lower() in SUFFIXES)
     if not files:
         raise OptionError("--panoramas", str(folder), "a folder with .exr or .hdr environment maps")
     return files
-
-
-def split_files(folder: Path, split: str) -> list[Path]:
-    """The maps of a split of a folder whose manifest.json names splits, by name.
-
-    Raises:
-        OptionError: no manifest, or no such split.
-    """
-    from ..training.panoramas import panorama_files as files_of_split
-
-    return sorted(files_of_split(folder, split))
 
 
 def prepare_output(args: argparse.Namespace) -> None:

@@ -34,7 +34,7 @@ from ..errors import ImageError
 from ..exposure import decode_display, luminance
 from ..shapes import BallImage, Image
 
-__all__ = ["SIDE", "BallFeatures", "ball_features"]
+__all__ = ["DARKEST", "SIDE", "SMALLEST", "BallFeatures", "ball_features"]
 
 SIDE: Final = 64
 """Pixels that balls are reduced to: what is told apart here is coarse, and a ball takes milliseconds."""
@@ -55,6 +55,7 @@ CLEAR: Final = 0.02
 NOISE: Final = 1e-3
 """Display values that detail is not told apart below: a quarter of a code of 8 bits."""
 DARKEST: Final = 0.01
+"""Linear value below which lights are not told apart: 6.6 stops below white."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ A map is judged by the mirror ball that it would show.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from ..ball import Ball, crop_ball
 from ..errors import ImageError, OptionError
@@ -14,13 +14,11 @@ from ..exposure import auto_exposure, expose
 from ..geometry import latlong_to_ball
 from ..resize import resize_latlong
 from ..shapes import Image, Latlong
-from .features import SIDE, ball_features
+from .features import SIDE, SMALLEST, ball_features
 from .judge import Check, Judge, shipped_judge
 from .surroundings import horizon_check, rim_check
 
 __all__ = ["Inspection", "inspect_map", "inspect_picture", "parse_ball"]
-
-SMALLEST: Final = 16
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ __all__ = [
     "Range",
     "shipped_judge",
     "verdict",
+    "worst_of",
 ]
 
 QUALITY_FILE: Final = Path(__file__).parent.parent / "data" / "quality.json"
@@ -126,6 +127,11 @@ OVERALL: Final = ("place", "whole", "mirror", "gloss")
 """Checks that the score of a ball is the worst of. Its colour may be the scene's, and does not count."""
 
 
+def _sigmoid(total: float) -> float:
+    """0 to 1; beyond 60 it is as near the ends as doubles tell."""
+    return 1 / (1 + math.exp(-max(-60.0, min(60.0, total))))
+
+
 @dataclass(frozen=True)
 class Logistic:
     """1 / (1 + exp(-(offset + weights · values))).
@@ -140,8 +146,7 @@ class Logistic:
 
     def __call__(self, values: Mapping[str, float]) -> float:
         """The score of values."""
-        total = self.offset + sum(weight * values[name] for name, weight in self.weights.items())
-        return 1 / (1 + math.exp(-max(-60.0, min(60.0, total))))
+        return _sigmoid(self.offset + sum(weight * values[name] for name, weight in self.weights.items()))
 
 
 @dataclass(frozen=True)
@@ -158,8 +163,7 @@ class Range:
 
     def score(self, value: float) -> float:
         """0.5 at the limit, 0.9 where it is typical, a logistic between and beyond."""
-        total = math.log(9) * (value - self.limit) / (self.typical - self.limit)
-        return 1 / (1 + math.exp(-max(-60.0, min(60.0, total))))
+        return _sigmoid(math.log(9) * (value - self.limit) / (self.typical - self.limit))
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.typical) and math.isfinite(self.limit)) or self.typical == self.limit:
@@ -207,16 +211,18 @@ class Judge:
             "measured_on": self.measured_on,
         }
 
+    def scores(self, values: Mapping[str, float]) -> dict[str, float]:
+        """The score of each check, of the numbers of a ball by name."""
+        return {name: logistic(values) for name, logistic in self.checks.items()}
+
     def score(self, features: BallFeatures) -> float:
-        """How good a mirror ball it is, 0 to 1: the worst of the checks in `OVERALL`."""
-        return min(self.checks[name](features.values()) for name in OVERALL)
+        """How good a mirror ball it is, 0 to 1, as `worst_of` says."""
+        return worst_of(self.scores(features.values()))
 
     def ball_checks(self, features: BallFeatures) -> list[Check]:
         """What a ball by itself shows."""
-        return [
-            verdict(name, self.checks[name](features.values()), kind.good, kind.bad, kind.suggestion)
-            for name, kind in CHECKS.items()
-        ]
+        scores = self.scores(features.values())
+        return [verdict(name, scores[name], kind.good, kind.bad, kind.suggestion) for name, kind in CHECKS.items()]
 
     def judge(self, ball_ldr: BallImage) -> tuple[float, list[Check]]:
         """Score and checks of a ball, (1, D, D, 3) display-encoded.
@@ -234,6 +240,11 @@ def _logistic(content: Any) -> Logistic:
     if unknown := weights.keys() - known.keys():
         raise ValueError(f"unknown numbers {sorted(unknown)}")
     return Logistic(weights, float(content["offset"]))
+
+
+def worst_of(scores: Mapping[str, float]) -> float:
+    """The worst of the checks in `OVERALL`, of the scores of all checks."""
+    return min(scores[name] for name in OVERALL)
 
 
 def verdict(name: str, score: float, good: str, bad: str, suggestion: str) -> Check:

@@ -20,7 +20,7 @@ from ..ball import Ball, crop_disc, disc_mask, require_canvas
 from ..errors import OptionError
 from ..exposure import decode_display, exposure_ratio, luminance
 from ..shapes import BallImage, Image
-from .features import BallFeatures
+from .features import DARKEST, BallFeatures
 from .judge import Check, Judge, Range, verdict
 
 __all__ = [
@@ -34,7 +34,6 @@ __all__ = [
 
 COARSE: Final = 32
 """Pixels along the longer side at which a photograph's contrast is taken: light, not texture."""
-DARKEST: Final = 0.01
 EMPTY: Final = (0.02, 0.98)
 """Display values at and beyond which a photograph holds nothing."""
 RING: Final = 0.12

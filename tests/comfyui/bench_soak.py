@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
@@ -32,6 +31,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).res
 import psutil  # noqa: E402  comes with ComfyUI
 import torch  # noqa: E402
 from comfy_host import PHOTO, REPOSITORY, free_port, launch, prepare  # noqa: E402
+from load_trial import GROWTH, SMOOTH, WARM, warm_and_end  # noqa: E402
 from PIL import Image  # noqa: E402
 
 from dl_core.imageio import atomic  # noqa: E402
@@ -40,11 +40,6 @@ from dl_core.queueing.ledger import Ledger  # noqa: E402
 from dl_core.queueing.pool import Job, Outcome, SilentWatcher  # noqa: E402
 from dl_core.queueing.workflow import Prompt, Workflow, read_workflow  # noqa: E402
 
-WARM = 20
-"""Jobs after which the server has loaded and allocated what it needs."""
-SMOOTH = 5
-"""Readings whose median counts: garbage is collected every few jobs."""
-GROWTH = 0.10
 EVERY = 10
 
 
@@ -153,10 +148,11 @@ def spoil(photo: Path, workflow: Workflow, fault: Bad) -> tuple[Path, Workflow]:
 
 def growth(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Memory after job 20 and at the end: medians of the last five readings by then."""
-    if len(rows) < WARM + SMOOTH:
-        return {"growth": None}
     resident = [row["resident_bytes"] for row in rows]
-    warm, end = median(resident[WARM - SMOOTH : WARM]), median(resident[-SMOOTH:])
+    levels = warm_and_end(resident)
+    if levels is None:
+        return {"growth": None}
+    warm, end = levels
     return {"warm_bytes": warm, "end_bytes": end, "highest_bytes": max(resident), "growth": end / warm - 1}
 
 
