@@ -292,7 +292,8 @@ def test_networks_in_half_precision_paint_the_same_ball(
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"sampler": "ddpm"}, "unipc, ddim, euler"),
+        ({"sampler": "heun"}, "unipc, ddim, euler, ddpm"),
+        ({"walk": 1}, "walk"),
         ({"batch": 0}, "batch"),
         ({"impute": "predicted", "sampler": "euler"}, "euler"),
     ],
@@ -367,3 +368,28 @@ def test_a_varied_painter_samples_and_guides_in_another_way(painter: DiffusersPa
         assert (other.balls - own.balls).abs().max() > 1e-3
     with pytest.raises(OptionError, match="sampler"):
         painter.varied(sampler="none")
+
+
+def test_a_stochastic_sampler_walks_its_own_way_from_the_same_start(
+    painter: DiffusersPainter, request_: PaintRequest
+) -> None:
+    drawn = painter.varied(sampler="ddpm", batch=1)
+    balls = drawn.paint(request_, SilentObserver()).balls
+    assert torch.equal(drawn.varied().paint(request_, SilentObserver()).balls, balls)
+    other_batch = drawn.varied(batch=2).paint(request_, SilentObserver()).balls
+    assert (other_batch - balls).abs().max() < 1e-4
+    other_walk = drawn.varied(walk=1).paint(request_, SilentObserver()).balls
+    assert (other_walk - balls).abs().max() > 1e-2
+    # Random networks: all that is known of the start is that the walk leaves it as it is.
+    last = replace(request_, strength=0.25)
+    assert torch.equal(
+        drawn.paint(last, SilentObserver()).balls, drawn.varied(walk=1).paint(last, SilentObserver()).balls
+    )
+
+
+def test_another_precision_leaves_the_painter_as_it_is(painter: DiffusersPainter, request_: PaintRequest) -> None:
+    before = painter.paint(request_, SilentObserver()).balls
+    halves = painter.in_precision(torch.bfloat16).paint(request_, SilentObserver()).balls
+    assert painter.pipeline.unet.dtype == torch.float32
+    assert torch.equal(painter.paint(request_, SilentObserver()).balls, before)
+    assert 0 < (halves - before).abs().mean() < 0.02  # bfloat16 keeps 8 bits

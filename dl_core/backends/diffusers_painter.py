@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from diffusers import (
     DDIMScheduler,
+    DDPMScheduler,
     EulerDiscreteScheduler,
     StableDiffusionXLControlNetInpaintPipeline,
     UniPCMultistepScheduler,
@@ -37,14 +39,19 @@ from .diffusers_lora import EXPOSURE, TURBO, add_lora
 from .mini import SCHEDULER_CONFIG, MiniModel, ModelDefaults, read_weights
 from .sdxl_files import load_base, load_controlnet
 
-__all__ = ["SAMPLERS", "DiffusersPainter", "Guidance", "ball_latent_mask"]
+__all__ = ["SAMPLERS", "STOCHASTIC", "DiffusersPainter", "Guidance", "ball_latent_mask"]
 
 SAMPLERS: Final[dict[str, Callable[..., Any]]] = {
     "unipc": lambda config: UniPCMultistepScheduler.from_config(config),
     "ddim": lambda config: DDIMScheduler.from_config(config, clip_sample=False, set_alpha_to_one=False),
     "euler": lambda config: EulerDiscreteScheduler.from_config(config),
+    "ddpm": lambda config: DDPMScheduler.from_config(config, clip_sample=False),
 }
-"""Deterministic samplers by name, the paper's first. A stochastic one would break the bond of seed and ball."""
+"""Samplers by name, the paper's first."""
+
+STOCHASTIC: Final = ("ddpm",)
+"""Samplers that draw noise at every step: each ball's from its own generator, so that a ball is its seed's still. What
+kind of ball a seed's initial noise makes is bound to it more loosely (the paper's appendix on stochastic sampling)."""
 
 PAPER_DEFAULTS: Final = ModelDefaults(
     canvas=1024, diameter=256, guidance=5.0, control_scale=0.5, lora_scale=EXPOSURE_SCALE, ev_min=-5.0
@@ -87,6 +94,7 @@ class DiffusersPainter:
         impute: noise put on what lies outside the mask, see `painter.Imputing`.
         lora_swap: when the pipeline's adapters `diffusers_lora.TURBO` and `EXPOSURE` act, in every pass; without it
             the pipeline's adapters stay as they are.
+        walk: another number has a sampler of `STOCHASTIC` draw other noise at its steps, from the same initial noise.
     """
 
     def __init__(
@@ -98,6 +106,7 @@ class DiffusersPainter:
         batch: int = 4,
         impute: Imputing = "initial",
         lora_swap: LoraSwap | None = None,
+        walk: int = 0,
     ) -> None:
         if sampler not in SAMPLERS:
             raise OptionError("sampler", sampler, ", ".join(SAMPLERS))
@@ -107,26 +116,43 @@ class DiffusersPainter:
             raise OptionError("impute", impute, ", ".join(IMPUTINGS))
         if impute == "predicted" and sampler == "euler":
             raise OptionError("impute", impute, "initial, with the euler sampler")
+        if walk and sampler not in STOCHASTIC:
+            raise OptionError("walk", walk, f"0, with a sampler that draws no noise at its steps, as {sampler}")
         self.pipeline = pipeline
         self.defaults = defaults
         self.sampler = sampler
         self._batches = Batches(batch, _empty_cache)
         self.impute = impute
         self.lora_swap = lora_swap
+        self.walk = walk
         self._acting: tuple[str, float] | None = None
         self._embeddings: dict[str, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
         self._encoded: list[tuple[Image, Any]] = []
 
-    def varied(self, *, sampler: str | None = None, guidance: float | None = None) -> DiffusersPainter:
-        """The same networks with another sampler or scale of guidance."""
+    def varied(
+        self,
+        *,
+        sampler: str | None = None,
+        guidance: float | None = None,
+        batch: int | None = None,
+        walk: int | None = None,
+    ) -> DiffusersPainter:
+        """The same networks with another sampler, scale of guidance, batch or walk."""
         return DiffusersPainter(
             self.pipeline,
             self.defaults if guidance is None else replace(self.defaults, guidance=guidance),
             sampler=sampler or self.sampler,
-            batch=self._batches.size,
+            batch=batch or self._batches.size,
             impute=self.impute,
             lora_swap=self.lora_swap,
+            walk=self.walk if walk is None else walk,
         )
+
+    def in_precision(self, dtype: torch.dtype) -> DiffusersPainter:
+        """A painter like this one on a copy of the networks in another floating-point type."""
+        painter = self.varied()
+        painter.pipeline = deepcopy(self.pipeline).to(dtype)
+        return painter
 
     @staticmethod
     def from_mini(model: MiniModel, **options: Any) -> DiffusersPainter:
@@ -239,7 +265,8 @@ class DiffusersPainter:
         if hasattr(scheduler, "set_begin_index"):  # those that count steps; DDIM reads the timestep it is given
             scheduler.set_begin_index(run.start)
 
-        clean, noise = self._start(encoded, seeds)
+        clean, noise, generators = self._start(encoded, seeds)
+        drawing = {"generator": generators} if self.sampler in STOCHASTIC else {}
         mask = ball_latent_mask(request.ball).to(clean)
         latents = (
             noise * scheduler.init_noise_sigma
@@ -256,7 +283,7 @@ class DiffusersPainter:
             if i + 1 == len(run) < len(timesteps):
                 latents = _predicted_clean(scheduler, predicted, seen, timestep)
             else:
-                latents = scheduler.step(predicted, timestep, latents, return_dict=False)[0]
+                latents = scheduler.step(predicted, timestep, latents, return_dict=False, **drawing)[0]
             if i + 1 == len(run):
                 known = clean
             else:
@@ -286,19 +313,23 @@ class DiffusersPainter:
         self._encoded = [*self._encoded[-1:], (canvas.clone(), encoded)]
         return encoded
 
-    def _start(self, encoded: Any, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    def _start(self, encoded: Any, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor, list[torch.Generator]]:
         """Clean latents of the canvas and initial noise of each ball, (n, 4, h, w) each, in single precision.
 
-        A sampling autoencoder draws from the ball's generator before the noise does, as in the authors' code.
+        A sampling autoencoder draws from the ball's generator before the noise does, as in the authors' code. The
+        generators come along: noise of the steps is drawn from them, in a walk of its own from generators beside them.
         """
         scale = self.pipeline.vae.config.scaling_factor
-        clean, noise = [], []
+        clean, noise, generators = [], [], []
         for seed in seeds:
             generator = torch.Generator().manual_seed(seed)
             sample = encoded.latent_dist.sample(generator) if hasattr(encoded, "latent_dist") else encoded.latents
             clean.append(sample.float() * scale)
             noise.append(torch.randn(sample.shape, generator=generator).to(clean[-1]))
-        return torch.cat(clean), torch.cat(noise)
+            if self.walk:
+                generator.manual_seed(int(torch.randint(2**62, (), generator=generator)) + self.walk)
+            generators.append(generator)
+        return torch.cat(clean), torch.cat(noise), generators
 
     def _denoiser(self, request: PaintRequest, hint: Tensor, count: int) -> Callable[[Tensor, Tensor], Tensor]:
         """The guided denoiser ε(z, t, C) of Algorithm 0 with text and depth bound."""
