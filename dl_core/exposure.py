@@ -195,8 +195,8 @@ def exposure_ratio(
     if int(known.sum()) < EVIDENCE_COUNT:
         return None
     ratios = torch.log2(darker[known].clamp(min=1e-6) / brighter[known]) + stops
-    error = float(ratios.median())
-    return error, float((ratios - error).abs().median())
+    error = float(ratios.detach().median())
+    return error, float((ratios.detach() - error).abs().median())
 
 
 def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -23,7 +22,6 @@ from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -35,18 +33,16 @@ from ..geometry import latlong_solid_angles
 from ..imageio import atomic, read_envmap, require_writable
 from ..presets import preset
 from ..resize import resize_latlong
-from ..shapes import Latlong
 from .cameras import random_camera, take
 from .journal import Journal
+from .map_distance import ROWS, log_error
 from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from .paintings import VARIANTS
-from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
+from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, say
 from .workers import check_workers, results_of
 
-__all__ = ["add_arguments", "fit_weights", "held_by_least_trusted", "log_error", "rank_correlation", "run"]
+__all__ = ["add_arguments", "fit_weights", "held_by_least_trusted", "rank_correlation", "run"]
 
-ROWS: Final = 16
-"""Of the maps whose directions are compared: 11 degrees."""
 EVIDENCE_KEY: Final = "evidence"
 ERROR_KEY: Final = "error"
 STEERED: Final = VARIANTS["both"]
@@ -115,7 +111,7 @@ def run(args: argparse.Namespace) -> None:
     wanted = [path for path in files if not journal.has(path.stem)]
     for rows in results_of(task, wanted, args.workers):
         journal.add(rows)
-        sys.stderr.write(f"{rows[0]['panorama']}: {len(rows)} photographs\n")
+        say(f"{rows[0]['panorama']}: {len(rows)} photographs")
     measured = sorted(journal.rows, key=lambda row: (row["panorama"], row["camera"]))
     if calibration is None:
         calibration = _calibrate(measured, args)
@@ -156,11 +152,6 @@ def _measure_panorama(
 
 def _rounded(values: Tensor) -> Any:
     return np.round(values.double().numpy(), 4).tolist()
-
-
-def log_error(estimate_hdr: Latlong, truth_hdr: Latlong) -> Float[Tensor, "h w"]:
-    """Stops between two maps of one size and one scale, by direction: the mean over the channels."""
-    return ((estimate_hdr + FLOOR) / (truth_hdr + FLOOR)).log2().abs().mean(dim=-1)[0]
 
 
 # --- statistics --------------------------------------------------------------------------------------------------

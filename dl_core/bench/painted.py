@@ -23,7 +23,7 @@ from .cameras import CAMERAS
 from .painters import PAINTERS, add_files, identity, open_studio
 from .paintings import VARIANTS, Painting, paint_maps, planned
 from .published import PUBLISHED
-from .report import Column, Report, Row, panorama_files, prepare_output, publish, table
+from .report import Column, Report, Row, panorama_files, prepare_output, publish, say, table
 from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
 
 __all__ = ["add_arguments", "run"]
@@ -64,9 +64,9 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
     baselines = open_baselines(compared, args.regressor, replace(settings, evs=chosen.evs))
     paint_maps(
-        paintings, studio.painter_of, chosen, settings, args.out, painter=identity(args.painter, files), report=_say
+        paintings, studio.painter_of, chosen, settings, args.out, painter=identity(args.painter, files), report=say
     )
-    answer_maps(answers, baselines, args.out, report=_say)
+    answer_maps(answers, baselines, args.out, report=say)
     rows = [row for painting in (*paintings, *answers) for row in _score(painting, args)]
     report = Report(
         f"protocol {args.protocol}",
@@ -83,10 +83,6 @@ def run(args: argparse.Namespace) -> int:
             "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
         )
     return 0
-
-
-def _say(line: str) -> None:
-    sys.stderr.write(line + "\n")
 
 
 def _names(text: str, table: Collection[str], option: str) -> list[str]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +37,7 @@ from .journal import Journal
 from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from .paintings import VARIANTS
 from .pareto_files import FIGURES, write_files
-from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
+from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, say
 from .schedules import GRIDS, Schedule
 from .scoring import MAP_ROWS, PROTOCOLS, SPHERES, score_maps
 from .shared_balls import SharedBalls
@@ -102,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
         convention=args.convention,
         seed=args.seed,
         workers=args.workers,
-        report=_say,
+        report=say,
     )
     rows = summarize(journal.rows, schedules, args.painter, args.seconds_per_step)
     summary = [row for row in rows if row["on_front"]]
@@ -129,10 +128,6 @@ def run(args: argparse.Namespace) -> None:
     if args.out is not None:
         write_files(args.out, rows, f"{args.painter}, panoramas: {len(files)}")
     publish(report, args, rows=_columns(args.seconds_per_step))
-
-
-def _say(line: str) -> None:
-    sys.stderr.write(line + "\n")
 
 
 def _schedules(grid: str, only: str | None) -> list[Schedule]:

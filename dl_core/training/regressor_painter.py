@@ -45,7 +45,7 @@ class RegressorPainter(DiffusersPainter):
         self, request: PaintRequest, encoded: Any, hint: Tensor, seeds: tuple[int, ...], counted: Callable[[int], None]
     ) -> Tensor:
         """One evaluation of the regressor for each ball, whatever the schedule."""
-        clean, _ = self._start(encoded, seeds)
+        clean, _, _ = self._start(encoded, seeds)
         disc = latent_disc(request.ball, clean.shape[-1], grow=request.ball.dilation)
         guidance, count = self.guidance_at(request.ev), len(seeds)
         found = self.pipeline.unet(
