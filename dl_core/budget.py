@@ -71,7 +71,7 @@ class Choice:
 
 def painted_balls(rounds: Rounds) -> int:
     """Balls that a schedule paints at one exposure, at most."""
-    return 1 if rounds.rounds == 0 else rounds.balls * rounds.rounds + rounds.final
+    return 1 if rounds.rounds == 0 else rounds.most * rounds.rounds + rounds.final
 
 
 def calibrate(painter: Painter, canvas: int, diameter: int, clock: Callable[[], float] = perf_counter) -> Pace:

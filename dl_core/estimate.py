@@ -144,8 +144,9 @@ def planned_evs(settings: Settings, painter: Painter | None = None) -> tuple[flo
 def planned_evaluations(painter: Painter, settings: Settings) -> int:
     """Denoiser evaluations that `estimate` will spend.
 
-    Exactly, with a fixed bracket and no tolerance; otherwise at most. An `iterative.SparingObserver` hears of those
-    that turn out not to be needed, so that the two together are what was planned.
+    Exactly, with a fixed bracket, no tolerance and no balls left out; otherwise at most. An
+    `iterative.SparingObserver` hears of those that turn out not to be needed, so that the two together are what was
+    planned.
     """
     return rounds_evaluations(painter, settings.rounds) * len(planned_evs(settings, painter))
 

@@ -1,7 +1,8 @@
 """Iterative inpainting: N balls, their median, and again from there.
 
 With a tolerance a round ends once its median is settled (`settling`), N being the most that it paints. Balls that are
-not like the others (`outliers`) are then left out of the median, and without a tolerance where that is asked for.
+not like the others (`outliers`) are then left out of the median. Without a tolerance that is done where it is asked
+for, and others are painted in their place: a median of 21 balls is √(30 / 21) times as far off as one of 30.
 
 Source: DiffusionLight, Algorithm 1 and Sec. 4.1.
 """
@@ -53,7 +54,8 @@ class Rounds:
         tolerance: error that a median may have, as `settling.error_bound` bounds it, in display values; a round ends
             once its median is within. Without one every round paints N balls.
         minimum: fewest balls of a round with a tolerance, N being the most in any case.
-        reject: whether balls unlike the others are left out of medians without a tolerance, too.
+        reject: whether balls unlike the others are left out of medians without a tolerance, too, and replaced, up to
+            half as many as N.
     """
 
     balls: int = 30
@@ -86,6 +88,11 @@ class Rounds:
     def counts(self) -> tuple[int, ...]:
         """Numbers of balls after which a round's median is looked at; N alone without a tolerance."""
         return (self.balls,) if self.tolerance is None else looks(self.minimum, self.balls)
+
+    @property
+    def most(self) -> int:
+        """Balls that a round paints at most."""
+        return self.balls + (self.balls // 2 if self.reject and self.tolerance is None else 0)
 
 
 @dataclass(frozen=True)
@@ -190,7 +197,7 @@ def iterative_inpaint(
 
         balls, tally = _settle(paint, heard, seed, rounds, crop_disc(request.ball), used)
         tallies.append(tally)
-        unpainted = rounds.balls - tally.painted
+        unpainted = rounds.most - tally.painted
         tell_spared(observer, painter.evaluations(unpainted, rounds.steps, strength, rounds.until))
         return balls
 
@@ -247,6 +254,10 @@ def _settle(
     if not rounds.reject:
         return balls, Tally(count)
     kept, left_out = _alike(balls, disc, seed)
+    while (wanting := min(rounds.balls - len(kept), rounds.most - count)) > 0:
+        balls, count = torch.cat((balls, paint(range(seed + count, seed + count + wanting)))), count + wanting
+        heard(balls)
+        kept, left_out = _alike(balls, disc, seed)
     return kept, Tally(count, left_out)
 
 
@@ -266,20 +277,23 @@ def _with_median(request: PaintRequest, median: BallImage, depth_of: Callable[[I
 
 
 def rounds_evaluations(painter: Painter, rounds: Rounds) -> int:
-    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure: exactly, with a tolerance at most."""
+    """Denoiser evaluations that `iterative_inpaint` will spend at one exposure.
+
+    Exactly, with neither a tolerance nor balls to be left out; otherwise at most.
+    """
     return _counted(painter.evaluations, rounds)
 
 
 def rounds_steps(rounds: Rounds) -> int:
-    """Denoising steps of all balls that `iterative_inpaint` will run at one exposure: with a tolerance at most."""
+    """Denoising steps of all balls that `iterative_inpaint` will run at one exposure; at most, as for evaluations."""
     return _counted(lambda balls, steps, strength, until: balls * len(steps_run(steps, strength, until)), rounds)
 
 
 def _counted(cost: Callable[[int, int, float, float], int], rounds: Rounds) -> int:
     if rounds.rounds == 0:
         return cost(1, rounds.steps, 1.0, 1.0)
-    first = cost(rounds.balls, rounds.steps, 1.0, rounds.until)
-    again = cost(rounds.balls, rounds.steps, rounds.strength, rounds.until) * (rounds.rounds - 1)
+    first = cost(rounds.most, rounds.steps, 1.0, rounds.until)
+    again = cost(rounds.most, rounds.steps, rounds.strength, rounds.until) * (rounds.rounds - 1)
     last = cost(1, rounds.steps, rounds.strength, 1.0) if rounds.final else 0
     return first + again + last
 
@@ -291,7 +305,8 @@ def tally_lines(result: IterativeResult, rounds: Rounds) -> list[str]:
         seeds = ", ".join(map(str, tally.left_out))
         if rounds.tolerance is None or tally.error is None:
             if seeds:
-                lines.append(f"round {number}: left out as unlike the others: seeds {seeds}")
+                count = f"{tally.painted} balls painted for a median of {tally.painted - len(tally.left_out)}"
+                lines.append(f"round {number}: {count}; left out as unlike the others: seeds {seeds}")
             continue
         verdict = "settled" if tally.error <= rounds.tolerance else "not settled"
         line = (

@@ -155,8 +155,9 @@ def reject_input() -> Any:
         "reject",
         default=False,
         optional=True,
-        tooltip="Leave balls that are unlike the others (faceted, matte, another scene) out of every median; the "
-        "report names their seeds. With a tolerance that is done in any case.",
+        tooltip="Leave balls that are unlike the others (faceted, matte, another scene) out of every median, and paint "
+        "others in their place, up to half as many again; the report names their seeds. With a tolerance they are left "
+        "out in any case.",
     )
 
 

@@ -45,7 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "leaves out balls unlike the others; the preset's balls are the most it paints (default: it paints them all)",
     )
     add("--min-balls", type=int, default=6, help="with --tolerance, the fewest balls of a round (default: 6)")
-    add("--reject", action="store_true", help="leave balls unlike the others out of medians without --tolerance, too")
+    add(
+        "--reject",
+        action="store_true",
+        help="leave balls unlike the others out and replace them; no --tolerance needed",
+    )
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
     add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
     add(
