@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--reject",
         action="store_true",
-        help="leave balls unlike the others out and replace them; no --tolerance needed",
+        help="leave balls unlike the others out, and replace them",
     )
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
     add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
