@@ -36,6 +36,7 @@ __all__ = [
     "merge_channel",
     "merge_paper",
     "merge_robust",
+    "parse_evs",
     "quantize",
 ]
 
@@ -120,6 +121,19 @@ def check_evs(evs: Sequence[float]) -> tuple[float, ...]:
     if not all(ev >= -40 for ev in values):
         raise OptionError("evs", tuple(evs), accepted + ", none below -40")
     return values
+
+
+def parse_evs(text: str) -> tuple[float, ...]:
+    """The EVs of a bracket from text, checked as `check_evs` does.
+
+    Raises:
+        OptionError: something else than numbers and commas, or EVs that are no bracket's.
+    """
+    try:
+        evs = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise OptionError("evs", text, "numbers and commas, such as 0,-2.5,-5") from error
+    return check_evs(evs)
 
 
 def _bracket(balls: Sequence[Tensor], evs: Sequence[float]) -> tuple[list[Tensor], tuple[float, ...]]:

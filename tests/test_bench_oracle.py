@@ -175,7 +175,7 @@ def test_a_map_that_is_not_2_to_1_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("options", "name"),
-    [(["--evs", "0;-2"], "--evs"), (["--evs", "0,-2,-2"], "evs"), (["--ball", "2"], "--ball")],
+    [(["--evs", "0;-2"], "evs"), (["--evs", "0,-2,-2"], "evs"), (["--ball", "2"], "--ball")],
 )
 def test_options_out_of_range_are_named(options: list[str], name: str, panoramas: Path) -> None:
     with pytest.raises(OptionError) as raised:

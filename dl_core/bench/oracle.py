@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from ..errors import OptionError
-from ..exposure import MERGES, auto_exposure, check_evs, expose, merge_bracket
+from ..exposure import MERGES, auto_exposure, expose, merge_bracket, parse_evs
 from ..geometry import ball_to_latlong, latlong_to_ball, latlong_to_perspective
 from ..imageio import read_envmap
 from ..metrics import angular_error, energy_kept, irradiance, si_rmse, spread_directions
@@ -150,7 +150,7 @@ def run(args: argparse.Namespace) -> None:
         ProbeError: options, maps or folders that cannot be used.
     """
     started = time.perf_counter()
-    brackets = [PAPER_EVS, LONG_EVS] if args.evs is None else [_parse_evs(text) for text in args.evs]
+    brackets = [PAPER_EVS, LONG_EVS] if args.evs is None else [parse_evs(text) for text in args.evs]
     levels = [ALIGNED] if args.misaligned is None else args.misaligned or list(MISALIGNMENTS)
     if not 16 <= args.ball <= 4096:
         raise OptionError("--ball", args.ball, "16 to 4096 pixels")
@@ -181,15 +181,6 @@ def _identity(args: argparse.Namespace, files: Sequence[Path], cases: Sequence[C
         "cases": [" ".join(map(str, case.labels().values())) for case in cases],
         "panoramas": fingerprint(*files),
     }
-
-
-def _parse_evs(text: str) -> tuple[float, ...]:
-    try:
-        return check_evs([float(value) for value in text.split(",")])
-    except OptionError:
-        raise
-    except ValueError as error:
-        raise OptionError("--evs", text, "numbers and commas, such as 0,-2.5,-5") from error
 
 
 def _cases(

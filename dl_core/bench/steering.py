@@ -26,7 +26,7 @@ from torch import Tensor
 from ..backends.loading import ModelFiles
 from ..ball import fit_canvas, paint_depth, place_ball
 from ..errors import OptionError
-from ..exposure import check_evs, decode_display, luminance
+from ..exposure import decode_display, luminance, parse_evs
 from ..imageio import read_envmap
 from ..iterative import Rounds, iterative_inpaint
 from ..painter import PaintRequest
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> None:
             cannot be written.
     """
     started = time.perf_counter()
-    files, evs = panorama_files(args.panoramas), _evs(args.evs)
+    files, evs = panorama_files(args.panoramas), parse_evs(args.evs)
     if args.structure_ev not in evs:
         raise OptionError("--structure-ev", args.structure_ev, "one of --evs")
     rounds = preset(args.preset).rounds
@@ -109,13 +109,6 @@ def run(args: argparse.Namespace) -> None:
         evaluations=sum(row["evaluations"] for row in rows),
     )
     publish(report, args, rows=_ROWS, summary=_SUMMARY)
-
-
-def _evs(text: str) -> tuple[float, ...]:
-    try:
-        return check_evs([float(value) for value in text.split(",")])
-    except ValueError as error:
-        raise OptionError("--evs", text, "numbers and commas, descending from 0") from error
 
 
 def bench_steering(

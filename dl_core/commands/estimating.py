@@ -23,7 +23,7 @@ from ..budget import check_budget, choose
 from ..depth import load_depth_model
 from ..errors import OptionError
 from ..estimate import Probe, Settings, bracket_remarks, confidence_remark, estimate, planned_evaluations
-from ..exposure import check_evs, check_merge
+from ..exposure import check_merge, parse_evs
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
 from ..iterative import Rounds, Tally, tally_lines
 from ..painter import IMPUTINGS, Painter, SilentObserver
@@ -143,7 +143,7 @@ def _preset(args: argparse.Namespace, name: str) -> Preset:
     """A preset with what the command line replaces of it."""
     chosen = preset(name)
     rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls, reject=args.reject)
-    return replace(chosen, rounds=rounds, evs=chosen.evs if args.evs is None else _parse_evs(args.evs))
+    return replace(chosen, rounds=rounds, evs=chosen.evs if args.evs is None else parse_evs(args.evs))
 
 
 def _choose(args: argparse.Namespace, loaded: LoadedPainter) -> tuple[str, list[str]]:
@@ -162,15 +162,6 @@ def _depth(name: str | None) -> tuple[Image | None, Callable[[Image], Image] | N
     if Path(name).is_dir():
         return None, load_depth_model(name, device="cuda" if torch.cuda.is_available() else "cpu")
     return read_photograph(name), None
-
-
-def _parse_evs(text: str) -> tuple[float, ...]:
-    try:
-        return check_evs([float(value) for value in text.split(",")])
-    except ValueError as error:
-        if isinstance(error, OptionError):
-            raise
-        raise OptionError("evs", text, "numbers and commas, such as 0,-2.5,-5") from error
 
 
 def _paint(
