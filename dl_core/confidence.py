@@ -5,7 +5,8 @@ not clip there. It is a robust standard deviation, in stops of luminance and in 
 the ball is. Balls that agree may all be wrong, so the spread alone is no error. What error to expect follows from it
 and from three things that need no second look at the scene: how far a direction lies from what the photograph shows,
 how near the rim it was seen, and how far its luminance lies from the map's mean. The weights of the five are measured
-(`Calibration`), on maps whose truth is known.
+(`Calibration`), on maps whose truth is known. How much of the light is misplaced in all is predicted beside it, from
+the map as a whole (`misplaced`).
 
 Sources: DiffusionLight, Sec. 4.1 (balls of different noise show different light); Iglewicz and Hoaglin, How to detect
 and handle outliers (ASQC 1993), for the median absolute deviation as a standard deviation.
@@ -13,6 +14,7 @@ and handle outliers (ASQC 1993), for the median absolute deviation as a standard
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -29,6 +31,7 @@ from .geometry import ball_to_latlong, latlong_directions, latlong_solid_angles
 from .json_text import read_json
 from .median import pixelwise_median, pixelwise_spread
 from .metrics import rgb_angles
+from .misplaced import OVERALL, overall_evidence
 from .outliers import NORMAL_MAD
 from .shapes import BallImage, Latlong
 
@@ -65,11 +68,13 @@ class Spread:
         stops: (1, D, D, 1) of luminance.
         degrees: (1, D, D, 1) of colour: angles between RGB vectors.
         balls: fewest that any exposure had.
+        clipped: share of the ball that the median at EV 0 shows clipped.
     """
 
     stops: Float[Tensor, "1 d d 1"]
     degrees: Float[Tensor, "1 d d 1"]
     balls: int
+    clipped: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,15 +84,20 @@ class Calibration:
     Attributes:
         weights: expected error in stops for a unit of each of `EVIDENCE`, 0 or more.
         measured_on: what was painted, by what, one sentence.
-        correlation: rank correlation of predicted and actual error over photographs it was not calibrated on; None
-            where that was not measured.
+        overall: log2 of the expected share of light misplaced for a unit of each of `misplaced.OVERALL`; None where no
+            share is predicted.
+        correlation: rank correlation of predicted and actual share of light misplaced over photographs it was not
+            calibrated on; None where that was not measured.
     """
 
     weights: tuple[float, ...]
     measured_on: str
+    overall: tuple[float, ...] | None = None
     correlation: float | None = None
 
     def __post_init__(self) -> None:
+        if self.overall is not None and len(self.overall) != len(OVERALL):
+            raise OptionError("overall", self.overall, f"{len(OVERALL)} numbers: {', '.join(OVERALL)}")
         if len(self.weights) != len(EVIDENCE) or not all(weight >= 0 for weight in self.weights):
             raise OptionError("weights", self.weights, f"{len(EVIDENCE)} numbers, 0 or more: {', '.join(EVIDENCE)}")
 
@@ -99,8 +109,10 @@ class Calibration:
             ModelError: it cannot be read, or is none.
         """
         try:
-            content = read_json(path)
-            return Calibration(**{**content, "weights": tuple(content["weights"])})
+            content = dict(read_json(path))
+            overall = content.get("overall")
+            listed = {"weights": tuple(content["weights"]), "overall": None if overall is None else tuple(overall)}
+            return Calibration(**{**content, **listed})
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise ModelError(path, f"cannot be used as a calibration of confidence ({error})") from error
 
@@ -117,11 +129,14 @@ class Confidence:
         error_stops: (1, H, 2H, 1) expected error of radiance, stops.
         calibration: that says so.
         balls: fewest that any exposure had.
+        misplaced: expected share of the light that is in the wrong place (`misplaced`); None where the calibration has
+            no say.
     """
 
     error_stops: Float[Tensor, "1 h w 1"]
     calibration: Calibration
     balls: int
+    misplaced: float | None = None
 
     @property
     def map(self) -> Float[Tensor, "1 h w 1"]:
@@ -137,11 +152,10 @@ class Confidence:
     def line(self) -> str:
         """One sentence for people."""
         held = self.calibration.correlation
-        ranked = (
-            "" if held is None else f"; over other photographs its rank correlation with the true error is {held:.2f}"
-        )
+        share = "" if self.misplaced is None else f", {self.misplaced:.0%} of the light misplaced"
+        ranked = "" if held is None else f"; the share's rank correlation over other photographs is {held:.2f}"
         return (
-            f"expected error {self.expected_error:.2f} stops (spread of {self.balls} balls; calibrated on "
+            f"expected error {self.expected_error:.2f} stops{share} (spread of {self.balls} balls; calibrated on "
             f"{self.calibration.measured_on}{ranked})"
         )
 
@@ -167,11 +181,12 @@ def bracket_spread(balls: Sequence[Float[Tensor, "_ d d 3"]], evs: Sequence[floa
     medians = [pixelwise_median(batch) for batch in balls]
     stops, degrees = _spread(balls[0], medians[0])
     clipped = _clips(medians[0])
+    share = float(clipped.float().mean()) * 4 / math.pi  # a crop's corners are beside the ball, and black
     for batch, median in zip(balls[1:], medians[1:], strict=True):
         darker = _spread(batch, median)
         stops, degrees = (torch.where(clipped, new, old) for new, old in zip(darker, (stops, degrees), strict=True))
         clipped = clipped & _clips(median)
-    return Spread(stops, degrees, min(map(len, balls)))
+    return Spread(stops, degrees, min(map(len, balls)), share)
 
 
 def _clips(median: BallImage) -> Tensor:
@@ -231,7 +246,12 @@ def confidence_of(spread: Spread, latlong_hdr: Latlong, calibration: Calibration
     calibration = calibration or shipped_calibration()
     found = evidence(spread, latlong_hdr)
     weights = torch.tensor(calibration.weights).to(found)
-    return Confidence(torch.einsum("k,khw->hw", weights, found)[None, ..., None], calibration, spread.balls)
+    error = torch.einsum("k,khw->hw", weights, found)[None, ..., None]
+    share = None
+    if calibration.overall is not None:
+        seen = overall_evidence(latlong_hdr, spread.stops, spread.clipped)
+        share = float(torch.exp2(seen.double() @ torch.tensor(calibration.overall, dtype=torch.float64)))
+    return Confidence(error, calibration, spread.balls, share)
 
 
 @cache

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.optimize import nnls
 from scipy.stats import spearmanr
 
-from dl_core.bench.confidence import fit_weights, held_by_least_trusted, rank_correlation
+from dl_core.bench.confidence_fit import fit_weights, held_by_least_trusted, rank_correlation
 from dl_core.bench.painters import PAINTERS, Studio
 from dl_core.cli import main
 from dl_core.confidence import (
@@ -252,6 +252,7 @@ def test_the_bench_calibrates_judges_and_goes_on(
     assert (tmp_path / "out" / "rows.jsonl").read_text() == before
     for mine, theirs in zip(again["rows"], report["rows"], strict=True):
         assert mine["error_stops"] == theirs["error_stops"]
+        assert mine["expected_misplaced"] == pytest.approx(theirs["expected_misplaced"], rel=1e-2)
         assert mine["expected_error_stops"] == pytest.approx(theirs["expected_error_stops"], rel=1e-2)
 
 

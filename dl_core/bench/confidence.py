@@ -1,11 +1,13 @@
 """`lightprobe bench confidence`: whether an estimate knows how wrong it is.
 
 Photographs are taken inside each panorama from several cameras, their light is estimated, and the error that the
-estimate expects of itself is compared with the one it has: over photographs by rank correlation, and over the
-directions of each map by what share of the worst tenth lies in the fifth that is trusted least.
+estimate expects of itself is compared with the one it has: over photographs by the rank correlation of the share of
+light misplaced, and over the directions of each map by what share of the worst tenth lies in the fifth that is trusted
+least. Directions are compared in radiance, for that is what lights a render, and in stops, in which a dark corner
+counts as much as a lamp.
 
-With `--calibrate FILE` the weights of the evidence are fitted to the errors by least squares, none below 0, and written
-to the file. Figures of a run that calibrates are on its own maps; run it again on others, with `--calibration FILE`.
+With `--calibrate FILE` the weights of the evidence are fitted to the errors and written to the file. Figures of a run
+that calibrates are on its own maps; run it again on others, with `--calibration FILE`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
@@ -29,25 +30,28 @@ from ..backends.loading import ModelFiles
 from ..confidence import EVIDENCE, FLOOR, Calibration, bracket_spread, evidence, shipped_calibration
 from ..errors import OptionError
 from ..estimate import Settings, estimate
-from ..geometry import latlong_solid_angles
+from ..exposure import luminance
 from ..imageio import atomic, read_envmap, require_writable
+from ..misplaced import OVERALL, ROWS, light_misplaced, overall_evidence
 from ..presets import preset
 from ..resize import resize_latlong
 from .cameras import random_camera, take
+from .confidence_fit import direction_shares, fit_shares, fit_weights, held_by_least_trusted, rank_correlation
 from .journal import Journal
-from .map_distance import ROWS, log_error
+from .map_distance import log_error
 from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from .paintings import VARIANTS
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, say
 from .workers import check_workers, results_of
 
-__all__ = ["add_arguments", "fit_weights", "held_by_least_trusted", "rank_correlation", "run"]
+__all__ = ["add_arguments", "run"]
 
 EVIDENCE_KEY: Final = "evidence"
 ERROR_KEY: Final = "error"
+OVERALL_KEY: Final = "overall"
+LEVEL_KEY: Final = "luminance"
+DIFFERENCE_KEY: Final = "difference"
 STEERED: Final = VARIANTS["both"]
-LEAST_TRUSTED: Final = 0.2
-WORST: Final = 0.1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,8 +125,10 @@ def run(args: argparse.Namespace) -> None:
         "painter": args.painter,
         "preset": args.preset,
         "cameras": "drawn for each panorama: fov 30 to 150, elevation -45 to 45, any azimuth",
+        "misplaced": "∫ |estimate - truth| dω / ∫ truth dω, of luminances",
         "error": f"mean over RGB of |log2| of estimate to truth, each plus {FLOOR:g}; maps of {ROWS} rows",
         "weights": dict(zip(EVIDENCE, calibration.weights, strict=True)),
+        "overall": None if calibration.overall is None else dict(zip(OVERALL, calibration.overall, strict=True)),
         "calibrated": "on these maps" if args.calibrate else f"on {calibration.measured_on}",
     }
     seconds = time.perf_counter() - started
@@ -143,9 +149,20 @@ def _measure_panorama(
         spread = bracket_spread([exposure.balls for exposure in probe.exposures], probe.evs)
         small = resize_latlong(probe.latlong_hdr, ROWS)
         error = log_error(small, resize_latlong(shot.truth_hdr, ROWS))
-        head = {"panorama": path.stem, "camera": camera.name, "evaluations": probe.evaluations}
+        level, truth = (luminance(resize_latlong(light, ROWS))[0, ..., 0] for light in (small, shot.truth_hdr))
+        seen = overall_evidence(probe.latlong_hdr, spread.stops, spread.clipped)
         rows.append(
-            {**head, EVIDENCE_KEY: _rounded(evidence(spread, small).flatten(1)), ERROR_KEY: _rounded(error.flatten())}
+            {
+                "panorama": path.stem,
+                "camera": camera.name,
+                "evaluations": probe.evaluations,
+                "misplaced": light_misplaced(probe.latlong_hdr, shot.truth_hdr),
+                OVERALL_KEY: _rounded(seen),
+                EVIDENCE_KEY: _rounded(evidence(spread, small).flatten(1)),
+                ERROR_KEY: _rounded(error.flatten()),
+                LEVEL_KEY: _rounded(level.flatten()),
+                DIFFERENCE_KEY: _rounded((level - truth).abs().flatten()),
+            }
         )
     yield rows
 
@@ -154,141 +171,81 @@ def _rounded(values: Tensor) -> Any:
     return np.round(values.double().numpy(), 4).tolist()
 
 
-# --- statistics --------------------------------------------------------------------------------------------------
-
-
-def _angles() -> NDArray[np.float64]:
-    """Solid angles of the directions, as shares of the sphere."""
-    angles = latlong_solid_angles(ROWS).double().expand(ROWS, 2 * ROWS).flatten().numpy()
-    return np.asarray(angles / angles.sum())
-
-
-def fit_weights(
-    found: NDArray[np.float64], errors: NDArray[np.float64], shares: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Weights, none below 0, whose sum over the evidence is nearest the errors in the mean square.
-
-    Args:
-        found: (k, n) the evidence.
-        errors: (n,) stops.
-        shares: (n,) how much each counts.
-
-    Returns:
-        (k,). Exact: the least squares without bounds on some of the evidence is the least squares with bounds if no
-        weight is below 0 there, and of all subsets with that the best is taken.
-    """
-    root = np.sqrt(shares)
-    design, target = (found * root).T, errors * root
-    best, least = np.zeros(len(found)), float(target @ target)
-    for count in range(1, len(found) + 1):
-        for chosen in combinations(range(len(found)), count):
-            weights, *_ = np.linalg.lstsq(design[:, chosen], target, rcond=None)
-            rest = target - design[:, chosen] @ weights
-            if (weights >= 0).all() and rest @ rest < least:
-                least, best = float(rest @ rest), np.zeros(len(found))
-                best[list(chosen)] = weights
-    return best
-
-
-def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
-    """Spearman's rank correlation; NaN where one of the two is all alike or there are fewer than two values.
-
-    Source: Spearman, The proof and measurement of association between two things (American Journal of Psychology 15,
-    1904); ties get their mean rank.
-    """
-    ranks = [_ranks(np.asarray(values)) for values in (first, second)]
-    if len(first) < 2 or any(np.ptp(rank) == 0 for rank in ranks):
-        return math.nan
-    return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
-
-
-def _ranks(values: NDArray[Any]) -> NDArray[np.float64]:
-    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
-    last = np.cumsum(counts)
-    return np.asarray((last - (counts - 1) / 2)[places], dtype=np.float64)
-
-
-def held_by_least_trusted(
-    expected: NDArray[np.float64], errors: NDArray[np.float64], shares: NDArray[np.float64]
-) -> float:
-    """Share of the worst tenth of directions that lies in the fifth that is trusted least; 0.2 by chance.
-
-    Args:
-        expected: (n,) errors expected.
-        errors: (n,) errors there are.
-        shares: (n,) of the sphere, that sum to 1.
-    """
-    doubted, worst = _top(expected, shares, LEAST_TRUSTED), _top(errors, shares, WORST)
-    return float((doubted * worst * shares).sum() / (worst * shares).sum())
-
-
-def _top(values: NDArray[np.float64], shares: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """1 on the highest values that make up so much of the sphere; the one at the edge counts in part."""
-    order = np.argsort(-values, kind="stable")
-    before = np.cumsum(shares[order]) - shares[order]
-    inside = np.empty(len(values))
-    inside[order] = np.clip((share - before) / shares[order], 0, 1)
-    return inside
-
-
-# --- judging -----------------------------------------------------------------------------------------------------
-
-
 def _calibrate(measured: Sequence[Row], args: argparse.Namespace) -> Calibration:
     """Weights fitted to what was measured, written to the file asked for."""
     found = np.concatenate([np.asarray(row[EVIDENCE_KEY]) for row in measured], axis=1)
     errors = np.concatenate([np.asarray(row[ERROR_KEY]) for row in measured])
-    weights = fit_weights(found, errors, np.tile(_angles(), len(measured)))
-    panoramas = len({row["panorama"] for row in measured})
+    weights = fit_weights(found, errors, np.tile(direction_shares(), len(measured)))
+    shares = np.log2([row["misplaced"] for row in measured])
+    names = [row["panorama"] for row in measured]
+    overall = fit_shares(np.asarray([row[OVERALL_KEY] for row in measured]), shares, names)
+    panoramas = len(set(names))
     said = f"{len(measured)} photographs in {panoramas} panoramas, painter {args.painter}, preset {args.preset}"
-    calibration = Calibration(tuple(round(float(weight), 4) for weight in weights), said)
+    calibration = Calibration(_weights(weights), said, _weights(overall))
     with atomic(args.calibrate) as temporary:
         temporary.write_text(json.dumps(calibration.document(), indent=1) + "\n", encoding="utf-8")
     return calibration
 
 
+def _weights(values: NDArray[np.float64]) -> tuple[float, ...]:
+    return tuple(round(float(value), 4) for value in values)
+
+
 def _judged(row: Row, calibration: Calibration) -> Row:
     """A photograph's row: its error, what was expected, and how well that is placed."""
-    shares, errors = _angles(), np.asarray(row[ERROR_KEY])
+    shares, errors, level = direction_shares(), np.asarray(row[ERROR_KEY]), np.asarray(row[LEVEL_KEY])
     expected = np.asarray(calibration.weights) @ np.asarray(row[EVIDENCE_KEY])
+    doubt = (level + FLOOR) * (np.exp2(expected) - 1)
+    predicted = None
+    if calibration.overall is not None:
+        predicted = float(np.exp2(np.asarray(calibration.overall) @ np.asarray(row[OVERALL_KEY])))
     return {
-        **{key: row[key] for key in ("panorama", "camera", "evaluations")},
+        **{key: row[key] for key in ("panorama", "camera", "evaluations", "misplaced")},
+        "expected_misplaced": predicted,
         "error_stops": float(shares @ errors),
         "expected_error_stops": float(shares @ expected),
-        "correlation_of_directions": rank_correlation(expected.tolist(), errors.tolist()),
-        "worst_tenth_in_least_trusted_fifth": held_by_least_trusted(expected, errors, shares),
+        "worst_tenth_in_least_trusted_fifth": held_by_least_trusted(doubt, np.asarray(row[DIFFERENCE_KEY]), shares),
+        "worst_tenth_in_least_trusted_fifth_stops": held_by_least_trusted(expected, errors, shares),
     }
 
 
 def _summary(rows: Sequence[Row]) -> list[Row]:
-    actual, expected = ([row[key] for row in rows] for key in ("error_stops", "expected_error_stops"))
-    held = [row["worst_tenth_in_least_trusted_fifth"] for row in rows]
-    correlations = [row["correlation_of_directions"] for row in rows]
+    def over(key: str) -> list[float]:
+        return [row[key] for row in rows if row[key] is not None]
+
+    means = ("misplaced", "expected_misplaced", "error_stops", "expected_error_stops", *_HELD)
+    correlations = {
+        name: rank_correlation(over(f"expected_{key}"), over(key)) if over(f"expected_{key}") else None
+        for name, key in (("rank_correlation", "misplaced"), ("rank_correlation_stops", "error_stops"))
+    }
     return [
         {
             "photographs": len(rows),
-            "rank_correlation": rank_correlation(expected, actual),
-            "error_stops_mean": fmean(actual),
-            "expected_error_stops_mean": fmean(expected),
-            "worst_tenth_in_least_trusted_fifth": fmean(held),
-            "correlation_of_directions": fmean(correlations),
+            **{name: None if value is None or math.isnan(value) else value for name, value in correlations.items()},
+            **{f"{key}_mean" if key not in _HELD else key: fmean(over(key)) if over(key) else None for key in means},
         }
     ]
 
 
+_HELD: Final = ("worst_tenth_in_least_trusted_fifth", "worst_tenth_in_least_trusted_fifth_stops")
 _ROWS: Final = (
     Column("panorama", "panorama"),
     Column("camera", "camera"),
+    Column("misplaced", "misplaced", ".2f"),
+    Column("expected", "expected_misplaced", ".2f"),
     Column("error (stops)", "error_stops", ".2f"),
     Column("expected", "expected_error_stops", ".2f"),
-    Column("correlation", "correlation_of_directions", ".2f"),
-    Column("worst tenth held", "worst_tenth_in_least_trusted_fifth", ".0%"),
+    Column("worst tenth held", _HELD[0], ".0%"),
+    Column("in stops", _HELD[1], ".0%"),
 )
 _SUMMARY: Final = (
     Column("photographs", "photographs"),
+    Column("misplaced", "misplaced_mean", ".2f"),
+    Column("expected", "expected_misplaced_mean", ".2f"),
     Column("rank correlation", "rank_correlation", ".2f"),
     Column("error (stops)", "error_stops_mean", ".2f"),
     Column("expected", "expected_error_stops_mean", ".2f"),
-    Column("worst tenth held by the least trusted fifth", "worst_tenth_in_least_trusted_fifth", ".0%"),
-    Column("correlation of directions", "correlation_of_directions", ".2f"),
+    Column("rank correlation", "rank_correlation_stops", ".2f"),
+    Column("worst tenth held by the least trusted fifth", _HELD[0], ".0%"),
+    Column("in stops", _HELD[1], ".0%"),
 )

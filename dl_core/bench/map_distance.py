@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from jaxtyping import Float
 from torch import Tensor
 
 from ..confidence import FLOOR
 from ..geometry import latlong_solid_angles
+from ..misplaced import ROWS
 from ..resize import resize_latlong
 from ..shapes import Latlong
 
-__all__ = ["ROWS", "log_error", "map_distance"]
-
-ROWS: Final = 16
-"""Of the maps whose directions are compared: 11 degrees."""
+__all__ = ["log_error", "map_distance"]
 
 
 def log_error(estimate_hdr: Latlong, truth_hdr: Latlong) -> Float[Tensor, "h w"]:

@@ -28,9 +28,9 @@ from ...backends.loading import ModelFiles
 from ...confidence import FLOOR
 from ...errors import OptionError
 from ...estimate import Settings
+from ...misplaced import ROWS
 from ...presets import preset
 from ..journal import Journal
-from ..map_distance import ROWS
 from ..painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from ..report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, say
 from ..workers import check_workers, results_of
