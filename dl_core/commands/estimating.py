@@ -242,6 +242,7 @@ def _report(
             "rounds": [[_tally(tally) for tally in exposure.tallies] for exposure in probe.exposures],
             "clipped": probe.clipped,
             "expected_error_stops": None if probe.confidence is None else probe.confidence.expected_error,
+            "expected_misplaced": None if probe.confidence is None else probe.confidence.misplaced,
             "seed": args.seed,
             "version": __version__,
             "notes": notes,
