@@ -111,6 +111,9 @@ def _small() -> Iterator[tuple[Rounds, tuple[float, ...]]]:
         yield Rounds(balls, 1, 0.8, 10, final=False, until=until), PAPER_EVS
     for until in (0.3, 1.0):
         yield Rounds(5, 1, 0.8, 10, until=until), PAPER_EVS
+    for name in ("fast", "balanced", "best"):  # with a last ball, or without the one they have
+        rounds = PRESETS[name].rounds
+        yield replace(rounds, final=not rounds.final), PAPER_EVS
     for evs in (PAPER_EVS[:1], PAPER_EVS[::2]):
         yield Rounds(5, 1, 0.8, 10, final=False), evs
     for tolerance in (0.03, 0.06):
