@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .ball import fit_canvas, paste_ball
+from .confidence import Confidence
 from .errors import OptionError
 from .estimate import Probe, Settings, check_photograph, estimate
 from .front_fill import FEATHER, check_fov, check_tilt, front_fill
@@ -96,7 +97,8 @@ def estimate_mended(
     """Estimate the light of a photograph, and mend around it.
 
     The photograph is balanced before it is painted in; map and ball are given its cast back, the map's front is filled,
-    and the map is levelled, in this order. `Probe.exposures` are as they were painted. Without any option this is
+    and the map is levelled, in this order. `Probe.exposures` are as they were painted, and the expected error is that of
+    the balls, also where the photograph fills the map. Without any option this is
     `estimate.estimate`, bit for bit.
 
     Args, Raises: as `estimate.estimate`; and what `Mending.check` raises, before anything is painted.
@@ -111,7 +113,18 @@ def estimate_mended(
     latlong = probe.latlong_hdr
     if mending.front_fill and mending.fov is not None:
         latlong, _ = front_fill(latlong, photo_ldr, mending.fov, feather=mending.feather)
-    return replace(probe, latlong_hdr=level(latlong, mending.pitch, mending.roll))
+    return replace(
+        probe,
+        latlong_hdr=level(latlong, mending.pitch, mending.roll),
+        confidence=_levelled(probe.confidence, mending),
+    )
+
+
+def _levelled(confidence: Confidence | None, mending: Mending) -> Confidence | None:
+    """What error to expect, turned as the map is."""
+    if confidence is None or not mending.levels:
+        return confidence
+    return replace(confidence, error_stops=level(confidence.error_stops, mending.pitch, mending.roll))
 
 
 def _with_cast(probe: Probe, photo_ldr: Image, gains: Float[Tensor, "3"]) -> Probe:

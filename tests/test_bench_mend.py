@@ -26,7 +26,7 @@ def panorama(tmp_path: Path) -> Path:
 
 
 def test_options_gain_on_noisy_balls(panorama: Path) -> None:
-    studio = Studio(lambda variant, shot: AnalyticPainter(shot.truth_hdr, Flaws(noise=0.1)), 128, 64)
+    studio = Studio(lambda variant, shot: AnalyticPainter(shot.truth_hdr, Flaws(noise=0.2)), 128, 64)
     settings = Settings(Rounds(balls=1, rounds=0, steps=4), (0.0, -2.5))
     settings = replace(settings, canvas=studio.canvas, diameter=studio.diameter)
     rows = {name: bench_mend([panorama], studio, settings, name) for name in ("front", "level")}

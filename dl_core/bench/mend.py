@@ -83,8 +83,8 @@ class _Setting:
         """Errors of a map, in the camera's own axes or in level ones."""
         truth, rotation = self.shot.truth_hdr, camera_rotation(0.0, pitch)
         truth = rotate_latlong(truth, rotation) if pitch else truth
-        picture = self.shot.photo_ldr.shape[1:3]
-        shown = frame_distance(truth.shape[1], *picture, self.camera.longer_fov, rotation) >= 0
+        rows, columns = self.shot.photo_ldr.shape[1:3]
+        shown = frame_distance(truth.shape[1], rows, columns, self.camera.longer_fov, rotation) >= 0
         weights = latlong_solid_angles(truth.shape[1]) * shown
         squares = (expose(latlong_hdr, 0.0) - expose(truth, 0.0)).square().mean(dim=-1)[0]
         spheres = score_maps(latlong_hdr, truth, "three-spheres", CONVENTION)
