@@ -97,9 +97,8 @@ def estimate_mended(
     """Estimate the light of a photograph, and mend around it.
 
     The photograph is balanced before it is painted in; map and ball are given its cast back, the map's front is filled,
-    and the map is levelled, in this order. `Probe.exposures` are as they were painted, and the expected error is that of
-    the balls, also where the photograph fills the map. Without any option this is
-    `estimate.estimate`, bit for bit.
+    and the map is levelled, in this order. `Probe.exposures` are as they were painted. The expected error is that of
+    the balls, also where the photograph fills the map. Without any option this is `estimate.estimate`, bit for bit.
 
     Args, Raises: as `estimate.estimate`; and what `Mending.check` raises, before anything is painted.
     """
