@@ -8,8 +8,7 @@ exposures of a bracket complete each other (`exposure.merge_robust`). A lamp tha
 surroundings would still lose the light that the photograph, which shows it sharp, has not beside it: within 12 degrees
 of clipped pixels (`REACH`) that light is gathered in them, so that the sum stays the map's.
 
-Measured behind the mini model and a painter without error (`lightprobe bench mend --options front`); the variants
-tried there are in its docstring.
+What it gains is measured by `lightprobe bench mend --options front`.
 
 Sources: Phongthawee et al., DiffusionLight, Sec. 4 (what the ball's rim shows); Debevec and Malik, Recovering high
 dynamic range radiance maps from photographs (SIGGRAPH 1997), for exposures that complete each other.

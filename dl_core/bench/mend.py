@@ -6,8 +6,8 @@ Photographs are taken inside panoramas, and maps estimated from them:
 - `level`: cameras that look up or down, their maps levelled by the pitch, against the level truth;
 - `white-balance`: panoramas given casts, photographs balanced before painting; the case names cast and method;
 - `second`: a second opinion, painted at another diameter and joined with the first one at the mean of their
-  logarithms, against twice as many balls at the painter's own diameter, which cost as much. It is here alone: see
-  `_second` for what was measured.
+  logarithms, against twice as many balls at the painter's own diameter, which cost as much. It is not on offer outside
+  this bench.
 
 Errors: `visible_rmse`, of display values at EV 0 over the directions that the photograph shows; and, as the total, the
 three errors of the paper's three spheres in linear radiance, each the mean over the spheres.
