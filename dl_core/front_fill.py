@@ -17,7 +17,7 @@ dynamic range radiance maps from photographs (SIGGRAPH 1997), for exposures that
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -28,7 +28,7 @@ from .exposure import clipping, decode_display
 from .geometry import camera_rotation, latlong_directions, latlong_solid_angles, perspective_to_latlong, require_latlong
 from .shapes import Latlong
 
-__all__ = ["FEATHER", "FOV_RANGE", "check_fov", "check_tilt", "frame_distance", "front_fill"]
+__all__ = ["FEATHER", "FOV_RANGE", "FrontFilled", "check_fov", "check_tilt", "frame_distance", "front_fill"]
 
 FOV_RANGE: Final = (5.0, 170.0)
 """Degrees across the longer side that a photograph may span."""
@@ -86,6 +86,20 @@ def frame_distance(
     return torch.rad2deg(torch.asin(torch.stack(sides).amin(dim=0).clamp(-1, 1)))
 
 
+class FrontFilled(NamedTuple):
+    """A map with its front filled.
+
+    Attributes:
+        latlong_hdr: (B, H, 2H, 3) linear radiance.
+        weight: (1, H, 2H) how much of each pixel is filled, 0 to 1; where it is 0 the map is as it was, bit for bit.
+        known: (1, H, 2H) how much of each pixel is the photograph's own light: less than `weight` where that clips.
+    """
+
+    latlong_hdr: Latlong
+    weight: Float[Tensor, "1 h w"]
+    known: Float[Tensor, "1 h w"]
+
+
 def front_fill(
     latlong_hdr: Latlong,
     photo_ldr: Float[Tensor, "1 rows columns 3"],
@@ -94,7 +108,7 @@ def front_fill(
     pitch: float = 0.0,
     roll: float = 0.0,
     feather: float = FEATHER,
-) -> tuple[Latlong, Float[Tensor, "1 h w"]]:
+) -> FrontFilled:
     """Fill the directions of a map that the photograph shows with the photograph.
 
     Args:
@@ -105,10 +119,6 @@ def front_fill(
         roll: degrees clockwise that the camera is turned on the map.
         feather: degrees inside the photograph's borders over which it takes over, 0 to 45; at most half the way to the
             photograph's middle.
-
-    Returns:
-        The map, and (1, H, 2H) how much of each pixel is filled, 0 to 1; where that is 0 the map is as it was, bit for
-        bit.
 
     Raises:
         OptionError: a map that is not 2:1, or an angle out of range.
@@ -130,7 +140,8 @@ def front_fill(
     filled = radiance + clipped * (latlong_hdr - radiance).clamp(min=0)
     mixed = torch.lerp(latlong_hdr, filled, weight[..., None])
     mixed = mixed + _gathered(latlong_hdr - mixed, clipped * weight[..., None])
-    return torch.where(weight[..., None] > 0, mixed, latlong_hdr), weight
+    known = weight * (1 - clipped.mean(dim=-1))
+    return FrontFilled(torch.where(weight[..., None] > 0, mixed, latlong_hdr), weight, known)
 
 
 def _gathered(lost: Float[Tensor, "b h w 3"], clipped: Float[Tensor, "1 h w 3"]) -> Float[Tensor, "b h w 3"]:

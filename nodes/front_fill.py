@@ -71,4 +71,4 @@ class FrontFill(io.ComfyNode):  # type: ignore[misc]
         """Check, fill."""
         photo = check_photograph(one_picture(photograph, "photograph"), "photograph")
         filled = front_fill(as_rgb(latlong, "latlong"), photo, fov, pitch=pitch, roll=roll, feather=feather)
-        return io.NodeOutput(*filled)
+        return io.NodeOutput(filled.latlong_hdr, filled.weight)

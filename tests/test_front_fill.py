@@ -39,7 +39,7 @@ def photograph(light: torch.Tensor, fov: float, pitch: float = 0.0, roll: float 
 @given(FOVS, ANGLES, ANGLES)
 def test_a_photograph_fills_its_own_directions_with_what_they_hold(fov: float, pitch: float, roll: float) -> None:
     truth = smooth()
-    filled, mask = front_fill(BLACK, photograph(truth, fov, pitch, roll), fov, pitch=pitch, roll=roll)
+    filled, mask, _ = front_fill(BLACK, photograph(truth, fov, pitch, roll), fov, pitch=pitch, roll=roll)
     inside = mask[0] == 1
     # Linear in the direction, a map's pixel of 2.8 degrees departs from its centre by 0.2 x 0.05 / 2 within it, and the
     # photograph holds its outer half pixel: 120 degrees over 128 pixels, 1.6 degrees at the middle, 0.2 x 0.028 / 2.
@@ -52,7 +52,7 @@ def test_a_photograph_fills_its_own_directions_with_what_they_hold(fov: float, p
 @given(FOVS, ANGLES, ANGLES, st.floats(0, 20))
 def test_what_is_filled_is_the_frame_and_grows_inward(fov: float, pitch: float, roll: float, feather: float) -> None:
     photo = photograph(smooth(), fov)
-    _, mask = front_fill(BLACK, photo, fov, pitch=pitch, roll=roll, feather=feather)
+    _, mask, _ = front_fill(BLACK, photo, fov, pitch=pitch, roll=roll, feather=feather)
     distance = frame_distance(HEIGHT, 96, 128, fov, camera_rotation(0.0, pitch, roll))
     assert float(mask.min()) >= 0
     assert float(mask.max()) <= 1
@@ -69,7 +69,7 @@ def test_what_is_filled_is_the_frame_and_grows_inward(fov: float, pitch: float, 
 def test_directions_that_are_not_filled_stay_bit_for_bit() -> None:
     generator = torch.Generator().manual_seed(0)
     latlong = torch.rand(2, HEIGHT, 2 * HEIGHT, 3, generator=generator) * 50
-    filled, mask = front_fill(latlong, torch.ones(1, 30, 40, 3), 60.0)  # all of it clips
+    filled, mask, _ = front_fill(latlong, torch.ones(1, 30, 40, 3), 60.0)  # all of it clips
     outside = mask[0] == 0
     assert torch.equal(filled[:, outside], latlong[:, outside])
     assert bool((mask > 0).any())
@@ -79,8 +79,8 @@ def test_a_mirrored_photograph_fills_a_mirrored_front() -> None:
     generator = torch.Generator().manual_seed(1)
     latlong = torch.rand(1, HEIGHT, 2 * HEIGHT, 3, generator=generator)
     photo = torch.rand(1, 48, 64, 3, generator=generator)
-    filled, mask = front_fill(latlong, photo, 70.0)
-    mirrored, mirrored_mask = front_fill(latlong.flip(2), photo.flip(2), 70.0)
+    filled, mask, _ = front_fill(latlong, photo, 70.0)
+    mirrored, mirrored_mask, _ = front_fill(latlong.flip(2), photo.flip(2), 70.0)
     torch.testing.assert_close(mirrored.flip(2), filled, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(mirrored_mask.flip(2), mask, rtol=1e-4, atol=1e-5)
 
@@ -113,7 +113,7 @@ def test_clipped_pixels_keep_the_radiance_of_the_map() -> None:
     latlong = latlong * (
         front_fill(BLACK, photo, 60.0)[0][..., :1] > 0.95
     )  # the map's lamp is where the photograph clips
-    filled, mask = front_fill(latlong, photo, 60.0)
+    filled, mask, _ = front_fill(latlong, photo, 60.0)
     lamp = (latlong[0, ..., 0] > 0) & (mask[0] == 1)
     assert bool(lamp.any())
     assert bool((filled[0][lamp][:, :2] >= latlong[0][lamp][:, :2] - 1e-4).all())
@@ -128,7 +128,7 @@ def test_light_smeared_around_a_clipped_lamp_is_gathered_in_it() -> None:
     sharp = 0.2 + 100.0 * (angle < 3).float()[None, ..., None].expand(-1, -1, -1, 3)
     spread = (angle < 8).float()[None, ..., None].expand(-1, -1, -1, 3)
     smeared = 0.2 + spread * ((sharp - 0.2) * weights).sum() / (spread * weights).sum()
-    filled, mask = front_fill(smeared, photograph(sharp, 60.0), 60.0)
+    filled, mask, _ = front_fill(smeared, photograph(sharp, 60.0), 60.0)
     total = [float((latlong * weights).sum()) for latlong in (smeared, filled)]
     assert total[1] == pytest.approx(total[0], rel=0.01)
     beside = (angle > 5) & (angle < 8) & (mask[0] == 1)
@@ -137,7 +137,7 @@ def test_light_smeared_around_a_clipped_lamp_is_gathered_in_it() -> None:
 
 def test_a_map_that_is_only_too_bright_gives_a_lamp_nothing_beyond_its_surroundings() -> None:
     photo = encode_display(torch.full((1, 60, 80, 3), 0.2))
-    filled, _ = front_fill(BLACK + 5.0, photo, 60.0)  # nothing clips: the photograph knows
+    filled, _, _ = front_fill(BLACK + 5.0, photo, 60.0)  # nothing clips: the photograph knows
     assert float(filled[0, HEIGHT // 2, HEIGHT].max()) == pytest.approx(0.2, rel=1e-3)
 
 
@@ -159,5 +159,5 @@ def test_angles_out_of_range_are_named(options: dict[str, float], name: str) -> 
 
 
 def test_a_narrow_photograph_is_not_all_feather() -> None:
-    _, mask = front_fill(torch.zeros(1, 512, 1024, 3), torch.ones(1, 30, 40, 3) * 0.5, 5.0, feather=FEATHER)
+    _, mask, _ = front_fill(torch.zeros(1, 512, 1024, 3), torch.ones(1, 30, 40, 3) * 0.5, 5.0, feather=FEATHER)
     assert float(mask.max()) == 1

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from analytic_painter import AnalyticPainter
+from analytic_painter import AnalyticPainter, Flaws
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
@@ -21,7 +22,7 @@ from dl_core.exposure import expose
 from dl_core.geometry import camera_rotation, latlong_directions, latlong_to_perspective, rotate_latlong
 from dl_core.imageio import read_envmap, read_exr_header
 from dl_core.iterative import Rounds
-from dl_core.mending import Mending, estimate_mended, level, mending_metadata, mending_remarks
+from dl_core.mending import SHOWN_STOPS, Mending, estimate_mended, level, mending_metadata, mending_remarks
 from dl_core.white_balance import cast_gains
 
 SETTINGS = Settings(rounds=Rounds(balls=2, rounds=1, steps=4, final=False), canvas=128, diameter=64, height=32)
@@ -72,6 +73,22 @@ def test_a_levelled_map_is_the_worlds(pitch: float) -> None:
     # Up to the exposure of the photograph, and what two bilinear steps blur.
     scale = float(levelled.sum() / world.sum())
     torch.testing.assert_close(levelled, world * scale, rtol=0.02, atol=0.0)
+
+
+def test_less_error_is_expected_where_the_photograph_shows_the_light() -> None:
+    many = replace(SETTINGS, rounds=replace(SETTINGS.rounds, balls=3))
+    dim = 0.2 * LIGHT  # nothing ahead clips
+    photo = expose(latlong_to_perspective(dim, 24, 32, fov=60.0), 0.0)
+    painter = AnalyticPainter(dim, Flaws(noise=0.2))
+    plain = estimate(photo, painter, many).confidence
+    filled = estimate_mended(photo, painter, many, Mending(front_fill=True, fov=60.0)).confidence
+    assert plain is not None
+    assert filled is not None
+    ahead = latlong_directions(32)[..., 2]
+    before, after = plain.error_stops[0, ..., 0], filled.error_stops[0, ..., 0]
+    assert torch.equal(after[ahead > -0.7], before[ahead > -0.7])
+    assert (after[ahead < -0.97] <= SHOWN_STOPS + 1e-6).all()
+    assert before[ahead < -0.97].mean() > 2 * SHOWN_STOPS
 
 
 def test_level_without_a_tilt_is_the_map_itself() -> None:
