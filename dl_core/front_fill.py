@@ -32,7 +32,7 @@ __all__ = ["FEATHER", "FOV_RANGE", "FrontFilled", "check_fov", "check_tilt", "fr
 
 FOV_RANGE: Final = (5.0, 170.0)
 """Degrees across the longer side that a photograph may span."""
-FEATHER: Final = 2.0
+FEATHER: Final = 1.0
 """Degrees inside the photograph's borders over which it takes over from the map."""
 REACH: Final = 12.0
 """Degrees around clipped pixels within which light of the map counts as theirs, smeared."""

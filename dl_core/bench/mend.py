@@ -9,10 +9,14 @@ Photographs are taken inside panoramas, and maps estimated from them:
   logarithms, against twice as many balls at the painter's own diameter, which cost as much. It is not on offer outside
   this bench.
 
-Errors: `visible_rmse`, of display values at EV 0 over the directions that the photograph shows; as the total,
-`map_stops`, the distance of the whole map from the truth; and what that does to a render, the three errors of the
-paper's three spheres in linear radiance, each the mean over the spheres. Of these normalized RMSE is no distance:
-percentiles of the estimate scale it, so that a map nearer the truth in every direction may be further off in it.
+Errors: `visible_rmse`, of display values at EV 0 over the directions that the photograph shows; of the whole map,
+`map_rmse`, of linear radiance, which its lights rule, and `map_stops`, in which shades count as much; and what that
+does to a render, the errors of the paper's three spheres in linear radiance, each the mean over the spheres.
+
+A map that comes nearer the truth in every direction has a smaller `map_rmse`, `map_stops` and, but for light that
+errors of both signs balance, `rmse` of spheres. It need not have a smaller `si_rmse` or `normalized_rmse`: they undo a
+scale, and the latter an offset, that an estimate which is off everywhere alike has as a whole, and a mended one no
+longer has.
 
 Sources: DiffusionLight, Sec. 5.1 (three spheres, cameras).
 """
@@ -29,11 +33,13 @@ from statistics import fmean, median
 from typing import Any, Final
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from ..backends.loading import ModelFiles
 from ..confidence import FLOOR
 from ..estimate import Probe, Settings
-from ..exposure import expose
+from ..exposure import expose, quantize
 from ..front_fill import frame_distance, front_fill
 from ..geometry import camera_rotation, latlong_solid_angles, rotate_latlong
 from ..imageio import read_envmap
@@ -49,11 +55,11 @@ from .paintings import VARIANTS
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 from .scoring import score_maps
 
-__all__ = ["OPTIONS", "Option", "add_arguments", "bench_mend", "run", "summarize"]
+__all__ = ["ERRORS", "OPTIONS", "Option", "add_arguments", "bench_mend", "run", "summarize"]
 
 CONVENTION: Final = "radiance"
-ON_SPHERES: Final = ("si_rmse", "angular_error_deg", "normalized_rmse")
-ERRORS: Final = ("visible_rmse", "map_stops", *ON_SPHERES)
+ON_SPHERES: Final = ("rmse", "si_rmse", "angular_error_deg", "normalized_rmse")
+ERRORS: Final = ("visible_rmse", "map_rmse", "map_stops", *ON_SPHERES)
 STEERED: Final = "both"
 """The row of the ablation whose exposures are steered."""
 SAME: Final = 1e-3
@@ -90,14 +96,21 @@ class _Setting:
         truth = rotate_latlong(truth, rotation) if pitch else truth
         rows, columns = self.shot.photo_ldr.shape[1:3]
         shown = frame_distance(truth.shape[1], rows, columns, self.camera.longer_fov, rotation) >= 0
-        weights = latlong_solid_angles(truth.shape[1]) * shown
-        squares = (expose(latlong_hdr, 0.0) - expose(truth, 0.0)).square().mean(dim=-1)[0]
+        everywhere = torch.ones_like(shown)
         spheres = score_maps(latlong_hdr, truth, "three-spheres", CONVENTION)
         return {
-            "visible_rmse": math.sqrt(float((squares * weights).sum() / weights.sum())),
+            "visible_rmse": _rmse(expose(latlong_hdr, 0.0), expose(truth, 0.0), shown),
+            "map_rmse": _rmse(latlong_hdr, truth, everywhere),
             "map_stops": map_distance(latlong_hdr, truth),
             **{key: fmean(row[key] for row in spheres) for key in ON_SPHERES},
         }
+
+
+def _rmse(one: Latlong, other: Latlong, where: Bool[Tensor, "h w"]) -> float:
+    """Root mean square difference of two maps over directions and channels."""
+    weights = latlong_solid_angles(one.shape[1]) * where
+    squares = (one - other).double().square().mean(dim=-1)[0]
+    return math.sqrt(float((squares * weights).sum() / weights.sum()))
 
 
 Case = tuple[str, dict[str, float], dict[str, float], int]
@@ -106,7 +119,8 @@ Case = tuple[str, dict[str, float], dict[str, float], int]
 
 def _front(at: _Setting) -> Iterator[Case]:
     probe = at.probe()
-    filled = front_fill(probe.latlong_hdr, at.shot.photo_ldr, at.camera.longer_fov).latlong_hdr
+    photo_ldr = quantize(at.shot.photo_ldr)  # as its file holds it
+    filled = front_fill(probe.latlong_hdr, photo_ldr, at.camera.longer_fov).latlong_hdr
     yield "filled", at.errors(probe.latlong_hdr), at.errors(filled), probe.evaluations
 
 
@@ -229,8 +243,9 @@ def run(args: argparse.Namespace) -> None:
             "preset": args.preset,
             "convention": CONVENTION,
             "visible_rmse": "of display values at EV 0 over the directions that the photograph shows",
+            "map_rmse": "of linear radiance, white at EV 0 being 1, over all directions",
             "map_stops": f"mean over directions and RGB of |log2| of the maps' ratio, each plus {FLOOR:g}; {ROWS} rows",
-            "spheres": "si_rmse, angular_error_deg, normalized_rmse: each the mean over the three",
+            "spheres": f"{', '.join(ON_SPHERES)}: each the mean over the three",
             "cameras": {name: [camera.name for camera in OPTIONS[name].cameras] for name in args.options},
             "casts": CASTS,
         },
@@ -293,7 +308,9 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     return summary
 
 
-_TITLES: Final = dict(zip(ERRORS, ("visible", "total", "si-RMSE", "angle", "n. RMSE"), strict=True))
+_TITLES: Final = dict(
+    zip(ERRORS, ("visible", "map RMSE", "map stops", "RMSE", "si-RMSE", "angle", "n. RMSE"), strict=True)
+)
 _ROWS: Final = (
     Column("panorama", "panorama"),
     Column("camera", "camera"),
