@@ -3,6 +3,9 @@
 A model has seen more neutral photographs than coloured ones. The photograph is scaled to a neutral mean in linear
 light, channel by channel; the radiance that is estimated in it is divided by the same gains.
 
+What it gains is measured by `lightprobe bench mend --options white-balance`. Colours come closer where there is a cast;
+where there is none, grey world takes the scene's own colour for one, and the mean of order 6 does so less.
+
 Sources: Buchsbaum, A spatial processor model for object colour perception (J. Franklin Institute, 1980), for grey
 world; Finlayson and Trezzi, Shades of gray and colour constancy (CIC 2004), for Minkowski means of order 6.
 """
