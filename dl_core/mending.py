@@ -105,7 +105,8 @@ def estimate_mended(
 
     The photograph is balanced before it is painted in; map and ball are given its cast back, the map's front is filled,
     and the map is levelled, in this order. `Probe.exposures` are as they were painted. The expected error falls to
-    `SHOWN_STOPS` where the photograph gives the light. Without any option this is `estimate.estimate`, bit for bit.
+    `SHOWN_STOPS` where the photograph gives the light; the share of light misplaced stays that of the balls. Without
+    any option this is `estimate.estimate`, bit for bit.
 
     Args, Raises: as `estimate.estimate`; and what `Mending.check` raises, before anything is painted.
     """

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
 from dl_core import cli
+from dl_core.backends.loading import BACKENDS, Backend, LoadedPainter
 from dl_core.bench.cameras import Camera, take
 from dl_core.bench.skies import SunAndSky
 from dl_core.errors import OptionError
@@ -113,13 +114,6 @@ def test_what_cannot_be_done_is_refused_before_painting(mending: Mending, name: 
     assert painter.requests == []
 
 
-def estimated(folder: Path, photo: Path, *options: str) -> Path:
-    out = folder / "probe.exr"
-    command = ["estimate", str(photo), "-o", str(out), "--preset", "draft", "--evs", "0", "--height", "32", "--json"]
-    assert cli.main([*command, *options]) == 0
-    return out
-
-
 def photograph(folder: Path, focal: int | None) -> Path:
     exif = Image.Exif()
     if focal is not None:
@@ -129,9 +123,14 @@ def photograph(folder: Path, focal: int | None) -> Path:
     return path
 
 
-def test_the_command_fills_levels_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    photo = photograph(tmp_path, 18)
-    out = estimated(tmp_path, photo, "--front-fill", "--pitch", "20", "--white-balance", "grey-world")
+def test_the_command_fills_levels_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend = Backend("paints the truth", lambda files, impute: LoadedPainter(AnalyticPainter(LIGHT), 128, 64))
+    monkeypatch.setitem(BACKENDS, "true", backend)
+    photo, out = photograph(tmp_path, 18), tmp_path / "probe.exr"
+    command = ["estimate", str(photo), "-o", str(out), "--backend", "true", "--preset", "draft", "--height", "32"]
+    assert cli.main([*command, "--front-fill", "--pitch", "20", "--white-balance", "grey-world", "--json"]) == 0
     notes = " ".join(json.loads(capsys.readouterr().out)["notes"])
     assert "90.0 degrees" in notes
     assert "pitch 20" in notes

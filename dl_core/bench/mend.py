@@ -46,12 +46,13 @@ from ..front_fill import frame_distance, front_fill
 from ..geometry import camera_rotation, latlong_solid_angles, rotate_latlong
 from ..imageio import read_envmap
 from ..mending import Mending, estimate_mended
+from ..misplaced import ROWS
 from ..presets import preset
 from ..shapes import Latlong
 from ..white_balance import WHITE_BALANCES
 from .cameras import Camera, Shot, take
 from .journal import Journal
-from .map_distance import ROWS, map_distance
+from .map_distance import map_distance
 from .painters import PAINTERS, Studio, add_files, identity, open_studio
 from .paintings import VARIANTS
 from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
