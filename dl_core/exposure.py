@@ -26,6 +26,7 @@ __all__ = [
     "auto_exposure",
     "check_evs",
     "check_merge",
+    "clipping",
     "decode_display",
     "encode_display",
     "expose",
@@ -155,10 +156,11 @@ def _takeover(exposed: Tensor, brighter: Tensor, darker: Tensor) -> Tensor:
 
     It takes over only where it reports more light (Algorithm 2, line 7).
     """
-    return _ramp(exposed) * (darker > brighter).to(exposed)
+    return clipping(exposed) * (darker > brighter).to(exposed)
 
 
-def _ramp(exposed: Tensor) -> Tensor:
+def clipping(exposed: Tensor) -> Tensor:
+    """How far linear values of an exposure clip: 0 up to 0.9 of its white, 1 from its white on."""
     return ((exposed - CLIP_THRESHOLD) / (1 - CLIP_THRESHOLD)).clamp(0, 1)
 
 
@@ -250,7 +252,7 @@ def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = G
     for i in range(len(balls) - 2, -1, -1):
         shown, stops = linear[i], evs[i] - evs[i + 1]
         scale = 2.0 ** (stops - exposure_error(shown, linear[i + 1], stops, gamma))
-        merged = shown + _ramp(shown) * (merged * scale - shown).clamp(min=0)
+        merged = shown + clipping(shown) * (merged * scale - shown).clamp(min=0)
     return merged
 
 

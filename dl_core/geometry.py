@@ -49,6 +49,7 @@ __all__ = [
     "latlong_solid_angles",
     "latlong_to_ball",
     "latlong_to_perspective",
+    "perspective_to_latlong",
     "require_latlong",
     "rotate_latlong",
     "sample_latlong",
@@ -539,6 +540,11 @@ def camera_rotation(yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> 
     return about_y @ about_x @ about_z
 
 
+def _require_fov(fov: float) -> None:
+    if not 1 <= fov <= 179:
+        raise OptionError("fov", fov, "1 to 179 degrees")
+
+
 def latlong_to_perspective(
     latlong: Latlong,
     height: int,
@@ -561,8 +567,7 @@ def latlong_to_perspective(
     Raises:
         OptionError: a map that is not 2:1, field of view or samples out of range.
     """
-    if not 1 <= fov <= 179:
-        raise OptionError("fov", fov, "1 to 179 degrees")
+    _require_fov(fov)
     require_latlong(latlong)
     extent = math.tan(math.radians(fov) / 2) * 2 / max(height, width)
     turn = (torch.eye(3) if rotation is None else rotation).to(latlong)
@@ -576,3 +581,62 @@ def latlong_to_perspective(
         return rays @ turn.T, torch.ones_like(rays[..., 0])
 
     return _average(latlong, cells, height * width, extent, samples).unflatten(1, (height, width))
+
+
+_SEEN_SAMPLES = 4
+"""Samples along each side of a map's pixel that a picture is looked up in; it is averaged to two of them a pixel."""
+
+
+def perspective_to_latlong(
+    picture: Image,
+    height: int,
+    *,
+    fov: float = 60.0,
+    rotation: Float[Tensor, "3 3"] | None = None,
+) -> tuple[Float[Tensor, "b rows columns c"], Float[Tensor, "1 rows columns"]]:
+    """The part of a map that a pinhole camera saw: the inverse of `latlong_to_perspective`.
+
+    Args:
+        picture: (B, h, w, C), linear if means are to be means of light.
+        height: rows of the map; its width is twice that.
+        fov: field of view across the picture's longer side, degrees, 1 to 179.
+        rotation: camera to world, as from `camera_rotation`; straight ahead when not given.
+
+    Returns:
+        (B, height, 2 height, C), each pixel the mean of what the picture shows of it, 0 where that is nothing; and
+        (1, height, 2 height), the share of each pixel that the picture shows, 0 to 1.
+
+    Raises:
+        OptionError: a height below 1, or a field of view out of range.
+    """
+    _require_fov(fov)
+    _require_height(height)
+    rows, columns = picture.shape[1:3]
+    half = math.tan(math.radians(fov) / 2)
+    across, up = half * columns / max(rows, columns), half * rows / max(rows, columns)
+    angle = math.pi / height
+    coarser = angle / (2 * half / max(rows, columns)) / (_SEEN_SAMPLES / 2)
+    if coarser > 1:
+        size = [max(1, math.ceil(side / coarser)) for side in (rows, columns)]
+        picture = F.interpolate(picture.permute(0, 3, 1, 2), size=size, mode="area").permute(0, 2, 3, 1)
+        rows, columns = picture.shape[1:3]
+    turn = (torch.eye(3) if rotation is None else rotation).to(picture)
+    ahead = -(latlong_directions(height, device=picture.device) @ turn)[..., 2].flatten()
+    near = torch.nonzero(ahead > math.cos(min(math.pi / 2, math.atan(math.hypot(across, up)) + 1.5 * angle))).squeeze(1)
+    means = picture.new_zeros(picture.shape[0], 2 * height**2, picture.shape[3])
+    shares = picture.new_zeros(1, 2 * height**2)
+    step = _subpixels(1, _SEEN_SAMPLES, picture.device)
+    for some in near.split((1 << 20) // _SEEN_SAMPLES**2):
+        row = torch.div(some, 2 * height, rounding_mode="floor")
+        v = ((row[:, None] + step) / height)[:, :, None].expand(-1, -1, _SEEN_SAMPLES)
+        u = (((some - row * 2 * height)[:, None] + step) / (2 * height))[:, None, :].expand(-1, _SEEN_SAMPLES, -1)
+        x, y, z = (spherical(u, v).flatten(1, 2) @ turn).unbind(-1)
+        depth = (-z).clamp(min=1e-6)
+        x, y = x / depth / across, y / depth / up
+        solid = torch.sin(v * math.pi).flatten(1)
+        seen = solid * ((z < 0) & (x.abs() <= 1) & (y.abs() <= 1))
+        values = _bilinear(picture, (x + 1) * (columns / 2), (1 - y) * (rows / 2))
+        total = seen.sum(dim=1)
+        means[:, some] = (values * seen[..., None]).sum(dim=2) / total.clamp(min=1e-12)[:, None]
+        shares[:, some] = total / solid.sum(dim=1)
+    return means.unflatten(1, (height, 2 * height)), shares.unflatten(1, (height, 2 * height))

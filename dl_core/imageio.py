@@ -42,6 +42,7 @@ __all__ = [
     "exr_channels",
     "is_envmap",
     "is_exr",
+    "open_photograph",
     "read_envmap",
     "read_exr_header",
     "read_photograph",
@@ -316,7 +317,7 @@ def read_photograph(path: str | Path, *, kept_side: int = KEPT_SIDE) -> Image:
     """
     path = Path(path)
     try:
-        with _open_photograph(path) as picture:
+        with open_photograph(path) as picture:
             factor = max(1, max(picture.size) // kept_side)
             picture.draft(None, (picture.width // factor, picture.height // factor))
             oriented = ImageOps.exif_transpose(_reduce(_displayable(path, picture), kept_side))
@@ -331,8 +332,12 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
-def _open_photograph(path: Path) -> PILImage.Image:
-    """Open lazily: size and mode are known, no pixel is decoded."""
+def open_photograph(path: Path) -> PILImage.Image:
+    """Open lazily, to be closed by the caller: size, mode and metadata are known, no pixel is decoded.
+
+    Raises:
+        ImageError: more than 175 million pixels; what Pillow raises of a missing or damaged file passes.
+    """
     PILImage.init()
     with warnings.catch_warnings():
         # The limit below is this package's own, and an error.

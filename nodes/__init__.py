@@ -13,6 +13,7 @@ from .equirect import BallToEquirect, EquirectToBall
 from .estimate_light import EstimateLight
 from .exposure import EVPromptInterp, HDRMerge
 from .fit import FitBall
+from .front_fill import FrontFill
 from .inpaint import ChromeBallInpaint, IterativeMedian
 from .light_model import LightModel
 from .loaders import MiniProbeLoader
@@ -38,6 +39,7 @@ NODES: tuple[type[io.ComfyNode], ...] = (
     EquirectToBall,
     ConfidenceMap,
     ProbeQuality,
+    FrontFill,
     LightModel,
     EstimateLight,
     BallGrid,

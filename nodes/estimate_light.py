@@ -20,13 +20,13 @@ from ..dl_core.estimate import (
     bracket_remarks,
     check_photograph,
     confidence_remark,
-    estimate,
     planned_evaluations,
     planned_evs,
 )
 from ..dl_core.exposure import check_evs
 from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import Rounds
+from ..dl_core.mending import estimate_mended, mending_remarks
 from ..dl_core.presets import PRESETS, Preset
 from ..dl_core.prompts import NEGATIVE_PROMPT
 from .confidence import CONFIDENCE_TOOLTIP
@@ -40,6 +40,7 @@ from .exposure import (
     merge_summary,
     prompt_inputs,
 )
+from .mending import mending_inputs, mending_of
 from .painter import ComfyPainter, Networks
 from .painting import (
     FINISHED,
@@ -127,6 +128,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                     "the one above, by a short calibration that counts. 0: the preset above.",
                 ),
                 reject_input(),
+                *mending_inputs(),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -176,6 +178,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
     ) -> io.NodeOutput:
         """Steer one painter to each exposure, and estimate."""
         photo = check_photograph(one_picture(image, "image"), "image")
+        mending = mending_of(options)
         values, prompts = check_evs(parse_evs(evs)), (prompt, dark_prompt, negative_prompt)
         told = []
         if budget:
@@ -190,9 +193,10 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         painter = _bracket_painter(observer, clip, prompts, planned_evs(settings), ev_min, options)
         observer.expect(planned_evaluations(painter, settings))
         near = None if depth is None else one_picture(depth, "depth")
-        probe = estimate(photo, painter, settings, depth=near, depth_of=depth_model, observer=observer)
+        probe = estimate_mended(photo, painter, settings, mending, depth=near, depth_of=depth_model, observer=observer)
         found = torch.cat([exposure.ball for exposure in probe.exposures])
-        report = "\n".join([*told, _report(probe, painter.seconds), *doubts(cls.hidden, preset, options["model"])])
+        told += [_report(probe, painter.seconds), *mending_remarks(mending)]
+        report = "\n".join([*told, *doubts(cls.hidden, preset, options["model"])])
         shown = (probe.latlong_hdr, probe.ball_hdr, probe.composite_ldr, found, probe.ball)
         return io.NodeOutput(*shown, report, _confidence(probe))
 

@@ -25,6 +25,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "quality": Subcommand("how well good balls are told from bad ones", f"{__package__}.quality"),
     "confidence": Subcommand("whether an estimate knows how wrong it is", f"{__package__}.confidence"),
     "stability": Subcommand("where the method fails, and what it depends on", f"{__package__}.stability.command"),
+    "mend": Subcommand("what options around an estimate gain", f"{__package__}.mend"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
     "lights": Subcommand("how small a light stands for a map, and how long it takes to find", f"{__package__}.lights"),
 }

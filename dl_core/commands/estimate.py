@@ -68,6 +68,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "preset's, authors with paper and turbo)",
     )
     add(
+        "--white-balance",
+        default="none",
+        help="take the photograph's cast out before painting, and give it back to the light: none, grey-world or "
+        "shades-of-grey (default: none)",
+    )
+    add(
+        "--front-fill",
+        action="store_true",
+        help="fill the directions that the photograph shows with the photograph; its field of view is that of --fov, "
+        "or of its EXIF data",
+    )
+    add("--fov", type=float, metavar="DEG", help="with --front-fill, field of view across the longer side, 5 to 170")
+    add("--pitch", type=float, metavar="DEG", help="that the camera looked up; the map's horizon is levelled by it")
+    add("--roll", type=float, metavar="DEG", help="that the camera was turned clockwise; likewise")
+    add(
         "--impute",
         default="initial",
         help="noise put on the photograph outside the ball: initial, as the authors' code, or predicted, as the "

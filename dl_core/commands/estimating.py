@@ -22,11 +22,13 @@ from ..bracket import check_bracket, ladder
 from ..budget import check_budget, choose
 from ..depth import load_depth_model
 from ..errors import OptionError
-from ..estimate import Probe, Settings, bracket_remarks, confidence_remark, estimate, planned_evaluations
+from ..estimate import Probe, Settings, bracket_remarks, confidence_remark, planned_evaluations
 from ..exposure import check_merge, parse_evs
 from ..imageio import read_photograph, require_writable, write_exr, write_hdr, write_png
 from ..iterative import Rounds, Tally, tally_lines
+from ..mending import Mending, estimate_mended, mending_metadata, mending_remarks
 from ..painter import IMPUTINGS, Painter, SilentObserver
+from ..photo_exif import choose_fov, read_camera
 from ..presets import DEFAULT_PRESET, PRESETS, Preset, preset
 from ..shapes import Image
 from ..spheres import sphere_sheet
@@ -113,6 +115,7 @@ def run(args: argparse.Namespace) -> None:
     if not 2 <= args.height <= 4096:
         raise OptionError("height", args.height, "2 to 4096 rows")
     outputs.require_writable([Path(name) for name in (args.photo, args.depth) if name is not None])
+    mending, remarks = _mending(args)
     photo = read_photograph(args.photo)
     depth, depth_of = _depth(args.depth)
     loaded = backend.load(ModelFiles.of(args), args.impute)
@@ -133,10 +136,33 @@ def run(args: argparse.Namespace) -> None:
         darkest=args.darkest,
     )
     painting = time.perf_counter()
-    probe = _paint(photo, loaded.painter, settings, depth, depth_of)
+    probe = _paint(photo, loaded.painter, settings, mending, depth, depth_of)
     painted = time.perf_counter()
-    written = _write(outputs, probe, {"lightprobe:preset": args.preset, "lightprobe:backend": args.backend})
+    extra = {"lightprobe:preset": args.preset, "lightprobe:backend": args.backend, **mending_metadata(mending)}
+    written = _write(outputs, probe, extra)
+    told = [*told, *remarks, *mending_remarks(mending)]
     _report(args, probe, written, told, {"total": time.perf_counter() - start, "painting": painted - painting})
+
+
+def _mending(args: argparse.Namespace) -> tuple[Mending, list[str]]:
+    """What to do around the estimate, checked, and what to say of the camera.
+
+    Raises:
+        OptionError: an option out of range, or a field of view that is missing or not wanted.
+    """
+    if args.fov is not None and not args.front_fill:
+        raise OptionError("fov", args.fov, "nothing without --front-fill")
+    tilt = {"pitch": args.pitch or 0.0, "roll": args.roll or 0.0}
+    asked = Mending(args.front_fill, args.fov, **tilt, white_balance=args.white_balance)
+    if not args.front_fill:
+        return asked.check(), []
+    replace(asked, fov=60.0 if args.fov is None else args.fov).check()  # all but whether there is a field of view
+    camera = read_camera(args.photo)
+    fov, remarks = choose_fov(args.fov, camera)
+    if fov is None:
+        why = camera.remarks[0] if camera.remarks else "the photograph's EXIF data do not tell it"
+        raise OptionError("fov", None, f"degrees across the longer side, by --fov: {why}")
+    return replace(asked, fov=fov).check(), remarks
 
 
 def _preset(args: argparse.Namespace, name: str) -> Preset:
@@ -168,11 +194,14 @@ def _paint(
     photo: Image,
     painter: Painter,
     settings: Settings,
+    mending: Mending,
     depth: Image | None,
     depth_of: Callable[[Image], Image] | None,
 ) -> Probe:
     with tqdm(total=planned_evaluations(painter, settings), unit="eval", desc="denoising", file=sys.stderr) as bar:
-        return estimate(photo, painter, settings, depth=depth, depth_of=depth_of, observer=_Progress(bar))
+        return estimate_mended(
+            photo, painter, settings, mending, depth=depth, depth_of=depth_of, observer=_Progress(bar)
+        )
 
 
 def probe_metadata(probe: Probe) -> dict[str, str]:

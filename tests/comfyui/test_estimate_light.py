@@ -335,3 +335,13 @@ def test_a_model_of_another_kind_is_refused_by_socket(node: Nodes, graph: Any) -
 
     with pytest.raises(pack_module("dl_core.errors").ModelError, match=r"^socket model: holds Identity"):
         whole(node, replace(graph, model=Sd15()))
+
+
+def test_the_front_is_that_of_the_single_node_and_the_horizon_is_level(node: Nodes, graph: Any) -> None:
+    once = {"preset": "custom", "balls": 1, "rounds": 0, "evs": "0"}
+    plain, *_ = whole(node, graph, **once)
+    mended, *_, report, _ = whole(node, graph, **once, front_fill=True, fov=70.0, pitch=15.0)
+    filled, _ = node("FrontFill").execute(plain, PHOTO, 70.0).args
+    assert torch.equal(mended, pack_module("dl_core.mending").level(filled, 15.0, 0.0))
+    assert "70 degrees" in report
+    assert "pitch 15" in report

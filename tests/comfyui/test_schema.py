@@ -31,6 +31,7 @@ SOCKETS = {
     "EquirectToBall": ("latlong", "ball_image"),
     "ConfidenceMap": ("balls ev latlong", "confidence picture expected_error report"),
     "ProbeQuality": ("balls ev composite ball photograph", "score report json"),
+    "FrontFill": ("latlong photograph", "latlong filled"),
     "LightModel": ("latlong", "latlong report picture"),
     "EstimateLight": (
         "model clip vae control_net image depth depth_model",
