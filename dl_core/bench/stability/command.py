@@ -38,7 +38,7 @@ from .measure import SECTIONS, Grid, Panorama
 from .page import write_page
 from .precision import precision_rows
 
-__all__ = ["GRIDS", "add_arguments", "run", "summarize"]
+__all__ = ["GRIDS", "Plan", "add_arguments", "bench_stability", "run", "summarize"]
 
 GRIDS: Final = {
     "small": Grid(scale_seeds=3, seeds=6, schedules=((1, 0), (5, 1), (15, 1), (5, 2)), steps=(10, 30)),

@@ -29,7 +29,7 @@ from ..shared_balls import SharedBalls
 from .changes import INVARIANCES, Change
 from .failures import FAILURES, Failure
 
-__all__ = ["SECTIONS", "Grid", "Panorama", "picture_of"]
+__all__ = ["SECTIONS", "Grid", "Panorama", "mean_distance", "picture_of"]
 
 STEERED: Final = VARIANTS["both"]
 APART: Final = 1000
