@@ -84,6 +84,11 @@ def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: 
         torch.testing.assert_close(latlong_energy(light[name]), latlong_energy(truth), rtol=0.01, atol=0)
     assert float(truth.max()) > 1.1
     assert float(light["base"].max()) <= 1.0  # one exposure ends at white
+    towards = latlong_directions(truth.shape[1])[..., 2]
+    ahead, behind = towards < -0.95, towards > 0
+    off = {name: (light[name] - truth).abs().mean(dim=-1)[0] for name in ("both", "filled")}
+    assert off["filled"][ahead].mean() < 0.5 * off["both"][ahead].mean()  # the ball's rim against the photograph
+    assert torch.equal(light["filled"][0, behind], light["both"][0, behind])
 
 
 def test_what_is_there_is_not_painted_again(panorama: Path, tmp_path: Path) -> None:

@@ -19,10 +19,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import OptionError
-from ..estimate import Probe, Settings, estimate
+from ..estimate import Probe, Settings
 from ..exposure import expose
 from ..geometry import latlong_to_ball
 from ..imageio import atomic, read_envmap, write_exr, write_png
+from ..mending import Mending, estimate_mended
 from ..painter import Observer, Painter
 from ..presets import Preset
 from .cameras import CAMERAS, Camera, Shot, take
@@ -38,11 +39,13 @@ class Variant:
         label: as Table 1 has it.
         iterative: medians of many balls; one ball otherwise.
         lora: exposures steered by the LoRA; without it EV 0 is all there is, and lights end at its white.
+        front_fill: the map's front filled with the photograph, whose field of view is known.
     """
 
     label: str
     iterative: bool
     lora: bool
+    front_fill: bool = False
 
     def settings(self, preset: Preset, base: Settings) -> Settings:
         """What to estimate: the preset's schedule and bracket, less what this row goes without."""
@@ -55,7 +58,9 @@ VARIANTS: Final[dict[str, Variant]] = {
     "iterative": Variant("base + iterative", iterative=True, lora=False),
     "lora": Variant("base + LoRA", iterative=False, lora=True),
     "both": Variant("base + iterative + LoRA", iterative=True, lora=True),
+    "filled": Variant("base + iterative + LoRA, front filled", iterative=True, lora=True, front_fill=True),
 }
+"""The rows of Table 1, and what `front_fill` makes of the last."""
 
 PainterOf = Callable[[Variant, Shot], Painter]
 """The painter of a variant; of a shot, too, for one that knows the truth."""
@@ -133,8 +138,12 @@ def paint_maps(
             continue
         shot = take(read_envmap(painting.panorama), painting.camera)
         variant = VARIANTS[painting.variant]
-        probe = estimate(
-            shot.photo_ldr, painter_of(variant, shot), variant.settings(preset, settings), observer=observer
+        probe = estimate_mended(
+            shot.photo_ldr,
+            painter_of(variant, shot),
+            variant.settings(preset, settings),
+            Mending(variant.front_fill, painting.camera.longer_fov),
+            observer=observer,
         )
         _keep(folder, painting, shot, probe)
         report(f"{number}/{len(paintings)} {painting.shot} {variant.label}: {probe.evaluations} evaluations")
