@@ -339,6 +339,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
         (["--tolerance", "0.1", "--min-balls", "2"], "minimum is 2"),
         (["--merge", "mean"], "merge is 'mean'; accepted: robust, channel, paper"),
         (["--backend", "flux"], "backend is 'flux'; accepted: mini, diffusers"),
+        (["--precision", "int8"], "--precision is 'int8'; accepted: float32, bfloat16, float16"),
         (["--seed", "-1"], "seed is -1; accepted: 0 to 4294967295"),
         (["--height", "0"], "height is 0"),
         (["--diameter", "300"], "diameter is 300; accepted: 16 to 256"),

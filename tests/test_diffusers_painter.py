@@ -15,6 +15,7 @@ from tolerances import assert_close
 from torch import Tensor
 
 from dl_core.backends.diffusers_painter import SAMPLERS, DiffusersPainter, ball_latent_mask
+from dl_core.backends.loading import BACKENDS, ModelFiles
 from dl_core.backends.mini import MiniModel, read_weights
 from dl_core.ball import Ball, crop_ball, paint_depth, place_ball
 from dl_core.errors import ImageError, Interrupted, ModelError, OptionError
@@ -368,6 +369,21 @@ def test_a_varied_painter_samples_and_guides_in_another_way(painter: DiffusersPa
         assert (other.balls - own.balls).abs().max() > 1e-3
     with pytest.raises(OptionError, match="sampler"):
         painter.varied(sampler="none")
+
+
+def test_the_mini_model_paints_the_same_ball_in_bfloat16(request_: PaintRequest) -> None:
+    """The same light from the same noise; another seed's is further off."""
+    asked = replace(request_, ball=place_ball(256, 128), seeds=(3, 4), steps=3)
+    canvas = torch.rand(1, 256, 256, 3, generator=torch.Generator().manual_seed(2))
+    asked = replace(asked, canvas=canvas, depth=paint_depth(None, asked.ball))
+    found = {}
+    for precision in (None, "bfloat16"):
+        painter = BACKENDS["mini"].load(ModelFiles(precision=precision), "initial").painter
+        assert isinstance(painter, DiffusersPainter)
+        assert painter.pipeline.unet.dtype == (torch.float32 if precision is None else torch.bfloat16)
+        found[precision] = painter.paint(asked, SilentObserver()).balls
+    apart = (found[None][0] - found[None][1]).abs().mean()
+    assert 0 < (found["bfloat16"] - found[None]).abs().mean() < 0.2 * apart
 
 
 def test_a_stochastic_sampler_walks_its_own_way_from_the_same_start(

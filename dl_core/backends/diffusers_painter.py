@@ -174,7 +174,13 @@ class DiffusersPainter:
 
     @staticmethod
     def from_files(
-        model: Path, controlnet: Path, lora: Path | None = None, turbo_lora: Path | None = None, **options: Any
+        model: Path,
+        controlnet: Path,
+        lora: Path | None = None,
+        turbo_lora: Path | None = None,
+        *,
+        dtype: torch.dtype | None = None,
+        **options: Any,
     ) -> DiffusersPainter:
         """A painter on SDXL from local files; nothing is downloaded.
 
@@ -183,6 +189,7 @@ class DiffusersPainter:
             controlnet: a depth ControlNet for SDXL, file or folder.
             lora: the exposure LoRA, a file; without it the dark exposures rest on the prompt alone.
             turbo_lora: the Turbo LoRA, a file; it takes the first timesteps of every pass, as `LoraSwap` says.
+            dtype: what the networks compute in; half precision on a GPU and single elsewhere when not given.
             options: as the constructor's.
 
         Raises:
@@ -192,7 +199,7 @@ class DiffusersPainter:
         if turbo_lora is not None and lora is None:
             raise OptionError("turbo_lora", str(turbo_lora), "none without an exposure LoRA, which follows it")
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        dtype = torch.float16 if device == "cuda" else torch.float32
+        dtype = dtype or (torch.float16 if device == "cuda" else torch.float32)
         base = load_base(model, dtype)
         control = load_controlnet(controlnet, base, dtype)
         pipeline = StableDiffusionXLControlNetInpaintPipeline(**base.components, controlnet=control)

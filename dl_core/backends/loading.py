@@ -14,7 +14,10 @@ from typing import Final
 from ..errors import OptionError
 from ..painter import Imputing, Painter
 
-__all__ = ["BACKENDS", "Backend", "LoadedPainter", "ModelFiles", "choose_backend", "quiet_libraries"]
+__all__ = ["BACKENDS", "PRECISIONS", "Backend", "LoadedPainter", "ModelFiles", "choose_backend", "quiet_libraries"]
+
+PRECISIONS: Final = ("float32", "bfloat16", "float16")
+"""Floating-point types that a model can compute in, by torch's names."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class ModelFiles:
         lora: the exposure LoRA.
         turbo_lora: the Turbo LoRA, which takes the first timesteps from the exposure LoRA.
         exposure_lora: whether LoRAs are used at all, the backend's own included.
+        precision: of `PRECISIONS`, what the networks compute in; None for float16 on a GPU, float32 elsewhere.
     """
 
     model: Path | None = None
@@ -34,13 +38,20 @@ class ModelFiles:
     lora: Path | None = None
     turbo_lora: Path | None = None
     exposure_lora: bool = True
+    precision: str | None = None
 
     @staticmethod
     def of(args: argparse.Namespace) -> ModelFiles:
-        """From the options `--model`, `--controlnet`, `--lora` and `--turbo-lora`."""
+        """From the options `--model`, `--controlnet`, `--lora`, `--turbo-lora` and `--precision`.
+
+        Raises:
+            OptionError: an unknown precision.
+        """
+        if args.precision not in (None, *PRECISIONS):
+            raise OptionError("--precision", args.precision, ", ".join(PRECISIONS))
         names = (args.model, args.controlnet, args.lora, args.turbo_lora)
         model, controlnet, lora, turbo_lora = (None if name is None else Path(name) for name in names)
-        return ModelFiles(model, controlnet, lora, turbo_lora)
+        return ModelFiles(model, controlnet, lora, turbo_lora, precision=args.precision)
 
 
 @dataclass(frozen=True)
@@ -87,15 +98,18 @@ def _load_mini(files: ModelFiles, impute: Imputing) -> LoadedPainter:
             value = str(getattr(files, name))
             raise OptionError(name, value, "nothing with the backend mini: its folder holds all of it")
     quiet_libraries()
+    import torch
+
     from .diffusers_painter import DiffusersPainter
     from .mini import MINI_FOLDER, load_mini
 
     model = load_mini(MINI_FOLDER if files.model is None else files.model)
     if not files.exposure_lora:
         model = replace(model, lora=None)
-    return LoadedPainter(
-        DiffusersPainter.from_mini(model, impute=impute), model.defaults.canvas, model.defaults.diameter
-    )
+    painter = DiffusersPainter.from_mini(model, impute=impute)
+    if files.precision is not None:
+        painter = painter.in_precision(getattr(torch, files.precision))
+    return LoadedPainter(painter, model.defaults.canvas, model.defaults.diameter)
 
 
 def _load_diffusers(files: ModelFiles, impute: Imputing) -> LoadedPainter:
@@ -103,10 +117,13 @@ def _load_diffusers(files: ModelFiles, impute: Imputing) -> LoadedPainter:
         name = "model" if files.model is None else "controlnet"
         raise OptionError(name, None, "a local file or folder; the backend diffusers downloads nothing")
     quiet_libraries()
+    import torch
+
     from .diffusers_painter import DiffusersPainter
 
+    dtype = None if files.precision is None else getattr(torch, files.precision)
     lora, turbo_lora = (files.lora, files.turbo_lora) if files.exposure_lora else (None, None)
-    painter = DiffusersPainter.from_files(files.model, files.controlnet, lora, turbo_lora, impute=impute)
+    painter = DiffusersPainter.from_files(files.model, files.controlnet, lora, turbo_lora, dtype=dtype, impute=impute)
     return LoadedPainter(painter, painter.defaults.canvas, painter.defaults.diameter)
 
 

@@ -71,12 +71,14 @@ def add_files(parser: argparse._ActionsContainer) -> None:
     """Declare the options that name a painter's files, as `ModelFiles.of` reads them."""
     for name, what in _FILES.items():
         parser.add_argument(f"--{name}", metavar="PATH", help=f"{what} of the painter, as for estimate")
+    parser.add_argument("--precision", metavar="TYPE", help="what its networks compute in, as for estimate")
 
 
 def identity(painter: str, files: ModelFiles) -> str:
-    """Name of a painter, with a fingerprint of its files if it has any."""
+    """Name of a painter, with a fingerprint of its files and its precision where they are named."""
     places = (files.model, files.controlnet, files.lora, files.turbo_lora)
-    return f"{painter} {fingerprint(*places)}" if any(places) else painter
+    named = f"{painter} {fingerprint(*places)}" if any(places) else painter
+    return named if files.precision is None else f"{named} {files.precision}"
 
 
 def open_studio(name: str, files: ModelFiles) -> Studio:

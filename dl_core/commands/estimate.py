@@ -95,6 +95,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--controlnet", metavar="PATH", help="diffusers: depth ControlNet for SDXL")
     add("--lora", metavar="PATH", help="diffusers: exposure LoRA")
     add("--turbo-lora", metavar="PATH", help="diffusers: Turbo LoRA for the first timesteps, with --preset turbo")
+    add(
+        "--precision",
+        metavar="TYPE",
+        help="what the networks compute in: float32, bfloat16 or float16 (default: float16 on a GPU, else float32)",
+    )
     add("--json", action="store_true", help="print the report as JSON")
 
 

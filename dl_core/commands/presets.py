@@ -19,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--controlnet", metavar="PATH", help="diffusers: depth ControlNet for SDXL")
     add("--lora", metavar="PATH", help="diffusers: exposure LoRA")
     add("--turbo-lora", metavar="PATH", help="diffusers: Turbo LoRA")
+    add("--precision", metavar="TYPE", help="what the networks compute in, as for estimate")
     add("--json", action="store_true", help="print as JSON")
 
 
