@@ -50,10 +50,7 @@ def test_errors_and_costs_are_those_of_the_chart_that_comes_along() -> None:
 
 
 def test_presets_keep_their_promises() -> None:
-    """Within the paper's intervals at a tenth of its cost in angle and si-RMSE, at a sixth in all; at a hundredth 1.3.
-
-    In normalized RMSE `balanced` lies above the paper's interval by 0.0023.
-    """
+    """Within the paper's intervals at a tenth of its cost, and at a sixth; at a hundredth 1.3 times as far off."""
     rows = {row["schedule"]: row for row in shipped_rows()}
     paper, balanced, best, draft = (rows[name] for name in ("paper", "balanced", "best", "draft"))
     assert balanced["nfe"] <= paper["nfe"] / 10
@@ -63,7 +60,7 @@ def test_presets_keep_their_promises() -> None:
         high = paper[f"{key.removesuffix('_deg')}_high"]
         assert best[key] <= high
         assert draft[key] <= 1.3 * paper[key]
-        assert balanced[key] <= high + 0.003 * (key == "normalized_rmse")
+        assert balanced[key] <= high
 
 
 def test_a_measured_schedule_is_a_star_and_another_one_a_line() -> None:

@@ -5,7 +5,8 @@ counted; seconds are this machine's, and those of any other by seconds a guided 
 three-spheres protocol and the direction of the strongest light, with intervals over the scenes.
 
 Balls that schedules share are painted once (`shared_balls`), and what is measured is kept line by line, so a run that
-is killed goes on and loses one estimate of each of its processes at most. Processes take a panorama each.
+is killed goes on and loses one estimate of each of its processes at most. A process takes those schedules of a panorama
+that may share balls.
 
 Source: DiffusionLight, Sec. 5.1 (errors) and the appendix on running time (the schedules it compares).
 """
@@ -64,7 +65,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--convention", choices=PROTOCOLS[PROTOCOL].conventions, default="published", help="how errors are counted")
     add("--seconds-per-step", type=float, help="of a guided step on the machine to plan for, for a column of its own")
     add("--seed", type=int, default=0, help="of the first ball (default: 0)")
-    add("--workers", type=int, default=1, help="processes, each with a panorama at a time (default: 1)")
+    add(
+        "--workers",
+        type=int,
+        default=1,
+        help="processes, each with a part of a panorama's schedules at a time (default: 1)",
+    )
     add_files(parser)
     add_output(parser)
 
@@ -164,7 +170,7 @@ def bench_pareto(
 
     Args:
         panoramas: maps.
-        studio_of: gives painter, canvas and ball; asked once a panorama.
+        studio_of: gives painter, canvas and ball; asked once a panorama and number of steps.
         schedules: to compare.
         journal: holds what is measured already, and keeps the rest.
         convention: of `PROTOCOLS`' three spheres.
@@ -176,9 +182,13 @@ def bench_pareto(
         OptionError: the journal holds a schedule of the same name that was something else.
     """
     _require_same(journal, schedules)
-    open_ones = [_Panorama(path, [s for s in schedules if not journal.has(path.stem, s.name)]) for path in panoramas]
-    task = partial(_measure_panorama, studio_of=studio_of, convention=convention, seed=seed)
-    for name, row in results_of(task, [one for one in open_ones if one.schedules], workers):
+    units = [
+        _Unit(path, [s for s in alike if not journal.has(path.stem, s.name)])
+        for alike in _alike(schedules)
+        for path in panoramas
+    ]
+    task = partial(_measure_unit, studio_of=studio_of, convention=convention, seed=seed)
+    for name, row in results_of(task, [unit for unit in units if unit.schedules], workers):
         if row is None:
             report(f"{name}: left out, this painter has no sampler or guidance to change")
             continue
@@ -186,24 +196,33 @@ def bench_pareto(
         report(f"{name}: {row['nfe']} evaluations")
 
 
+def _alike(schedules: Sequence[Schedule]) -> list[list[Schedule]]:
+    """Schedules that may share balls, which those of other numbers of steps do not; the dearest first, so that workers
+    end at nearly the same time."""
+    groups: dict[int, list[Schedule]] = {}
+    for schedule in schedules:
+        groups.setdefault(schedule.preset.rounds.steps, []).append(schedule)
+    return sorted(groups.values(), key=lambda group: -max(schedule.preset.guided_steps for schedule in group))
+
+
 @dataclass(frozen=True)
-class _Panorama:
-    """A map and the schedules that are not measured on it yet."""
+class _Unit:
+    """A map and schedules that are not measured on it yet: a worker's piece of work."""
 
     path: Path
     schedules: list[Schedule]
 
 
-def _measure_panorama(
-    panorama: _Panorama, studio_of: Callable[[], Studio], convention: str, seed: int
+def _measure_unit(
+    unit: _Unit, studio_of: Callable[[], Studio], convention: str, seed: int
 ) -> Iterator[tuple[str, Row | None]]:
     """What is measured, by name, and its row; None for a schedule that the painter cannot run."""
-    studio, stem = studio_of(), panorama.path.stem
-    shot = take(read_envmap(panorama.path), Camera())
+    studio, stem = studio_of(), unit.path.stem
+    shot = take(read_envmap(unit.path), Camera())
     own = studio.painter_of(STEERED, shot)
     painters: dict[tuple[str | None, float | None], SharedBalls] = {}
     base = Settings(seed=seed, canvas=studio.canvas, diameter=studio.diameter, darkest=darkest_of(own))
-    for schedule in panorama.schedules:
+    for schedule in unit.schedules:
         name, varied = f"{stem} {schedule.name}", schedule.painter(own)
         if varied is None:
             yield name, None
