@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers",
         type=int,
         default=1,
-        help="processes, each with a part of a panorama's schedules at a time (default: 1)",
+        help="processes, each with a part of a panorama at a time (default: 1)",
     )
     add_files(parser)
     add_output(parser)
