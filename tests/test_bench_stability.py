@@ -143,7 +143,7 @@ def test_behind_a_perfect_painter_nothing_matters_and_runs_go_on(
     panoramas: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(PAINTERS, "true", perfect)
-    monkeypatch.setitem(command.GRIDS, "small", Grid(2, 2, ((1, 0), (3, 1)), (2,)))
+    monkeypatch.setitem(command.GRIDS, "small", Grid(2, 2, ((1, 0), (3, 1)), (2,), 2))
     out = tmp_path / "out"
     asked = ["bench", "stability", "--panoramas", str(panoramas), "--painter", "true", "--out", str(out), "--json"]
     assert main(asked) == 0
@@ -180,7 +180,7 @@ def test_samplers_and_precisions_of_a_diffusion_model(panoramas: Path) -> None:
     painter = DiffusersPainter.from_mini(model, batch=2)
     studio = Studio(lambda variant, shot: painter, 128, 64)
     settings = Settings(rounds=ROUNDS, evs=(0.0,), canvas=128, diameter=64, height=32)
-    panorama = Panorama(panoramas / "sides.exr", studio, settings, Grid(2, 2, (), (2,)), None)
+    panorama = Panorama(panoramas / "sides.exr", studio, settings, Grid(2, 2, (), (2,), 2), None)
     found = {}
     for section in ("samplers", "numerics"):
         for _, variant, measured in measure.SECTIONS[section](panorama):

@@ -41,12 +41,13 @@ from .precision import precision_rows
 __all__ = ["GRIDS", "Plan", "add_arguments", "bench_stability", "run", "summarize"]
 
 GRIDS: Final = {
-    "small": Grid(scale_seeds=3, seeds=6, schedules=((1, 0), (5, 1), (15, 1), (5, 2)), steps=(10, 30)),
+    "small": Grid(scale_seeds=3, seeds=6, schedules=((1, 0), (5, 1), (15, 1), (5, 2)), steps=(10, 30), starts=4),
     "full": Grid(
         scale_seeds=6,
         seeds=30,
         schedules=((1, 0), (5, 1), (15, 1), (30, 1), (5, 2), (15, 2), (30, 2)),
         steps=(10, 30, 100),
+        starts=10,
     ),
 }
 """How much to measure, by name: `small` for half an hour on two processors."""

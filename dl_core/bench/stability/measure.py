@@ -45,12 +45,14 @@ class Grid:
         seeds: estimates of every schedule whose spread is measured.
         schedules: numbers of balls and rounds, (N, k).
         steps: of the samplers that are compared.
+        starts: balls from other seeds that each of them paints.
     """
 
     scale_seeds: int
     seeds: int
     schedules: tuple[tuple[int, int], ...]
     steps: tuple[int, ...]
+    starts: int
 
 
 class _Counter(SilentObserver):
@@ -238,7 +240,8 @@ def _seeds(panorama: Panorama) -> Iterator[tuple[str, str, Measured]]:
 
 
 def _samplers(panorama: Panorama) -> Iterator[tuple[str, str, Measured]]:
-    """One ball: a deterministic sampler against the preset's; a stochastic one against itself from the same start."""
+    """One ball from each of several starts: a deterministic sampler against the preset's from the same starts, a
+    stochastic one against other noise at its steps; beside the distance between starts."""
     from ...backends.diffusers_painter import SAMPLERS, STOCHASTIC, DiffusersPainter
 
     painter = panorama.painter()
@@ -248,16 +251,17 @@ def _samplers(panorama: Panorama) -> Iterator[tuple[str, str, Measured]]:
     def measured(variant: str, sampler: str, steps: int) -> Row:
         schedule = replace(panorama.settings.rounds, rounds=0, steps=steps)
         first = replace(panorama.settings, rounds=schedule)
+        starts = [panorama.with_seed(number, first) for number in range(panorama.grid.starts)]
         chosen, counter = painter.varied(sampler=sampler), _Counter()
 
-        def light(settings: Settings, by: Painter) -> Latlong:
-            return panorama.probe(settings, painter=by, counter=counter).latlong_hdr
+        def lights(by: Painter) -> list[Latlong]:
+            return [panorama.probe(start, painter=by, counter=counter).latlong_hdr for start in starts]
 
-        own = light(first, chosen)
-        other = light(first, chosen.varied(walk=1) if sampler in STOCHASTIC else painter)
-        apart = map_distance(own, light(panorama.with_seed(1, first), chosen))
-        more = {"error": map_distance(own, panorama.shot.truth_hdr), "evaluations": counter.total}
-        return _row(panorama, "samplers", variant, map_distance(own, other), apart, **more)
+        own, other = lights(chosen), lights(chosen.varied(walk=1) if sampler in STOCHASTIC else painter)
+        distance = fmean(map_distance(first, second) for first, second in zip(own, other, strict=True))
+        error = fmean(map_distance(light, panorama.shot.truth_hdr) for light in own)
+        more = {"error": error, "evaluations": counter.total}
+        return _row(panorama, "samplers", variant, distance, mean_distance(own), **more)
 
     for steps in panorama.grid.steps:
         for sampler in SAMPLERS:
