@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--precision",
         metavar="TYPE",
-        help="what the networks compute in: float32, bfloat16 or, on a GPU, float16 (default: float16 on a GPU, else float32)",
+        help="what the networks compute in: float32, bfloat16, or float16 on a GPU (default there; else float32)",
     )
     add("--json", action="store_true", help="print the report as JSON")
 
