@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -116,14 +118,21 @@ def test_the_regressor_gives_one_ball_whatever_the_seed_and_what_stood_there(
 def test_training_lowers_the_regressors_error(bank: Tensor, tmp_path: Path) -> None:
     torch.manual_seed(0)
     sampler = SceneSampler(bank[:1], 64, 32, 0, bracket=True, centred=1.0)
-    losses: list[float] = []
 
-    def heard(line: str) -> None:
-        losses.append(float(line.rsplit(" ", 1)[1]))
+    def mean_loss(steps: int) -> float:
+        """Over all steps; a report tells the mean since the last one, which comes when ten seconds are over."""
+        told: list[tuple[int, float]] = [(0, 0.0)]
 
-    train_regressor(MiniModel.untrained(), sampler, Budget(1, 3e-4, warmup=1), tmp_path / "a", batch=2, report=heard)
-    train_regressor(MiniModel.untrained(), sampler, Budget(12, 3e-4, warmup=1), tmp_path / "b", batch=2, report=heard)
-    assert losses[1] < losses[0]
+        def heard(line: str) -> None:
+            step, loss = re.fullmatch(r"step (\d+)/.* loss (.*)", line).groups()  # type: ignore[union-attr]
+            told.append((int(step), float(loss)))
+
+        budget = Budget(steps, 3e-4, warmup=1)
+        train_regressor(MiniModel.untrained(), sampler, budget, tmp_path / str(steps), batch=2, report=heard)
+        assert told[-1][0] == steps
+        return sum(loss * (step - before) for (before, _), (step, loss) in pairwise(told)) / steps
+
+    assert mean_loss(12) < mean_loss(1)
 
 
 def test_answers_are_written_once_with_their_cost(
