@@ -25,6 +25,7 @@ from dl_core.geometry import ball_coverage, rotate_latlong
 from dl_core.imageio import read_envmap, read_exr_header, write_exr
 from dl_core.painter import PaintRequest, SilentObserver
 from dl_core.training.export import write_networks
+from dl_core.training.feed import Feed
 from dl_core.training.loop import Budget
 from dl_core.training.mean_light import mean_light, write_mean_light
 from dl_core.training.regressor import train_regressor
@@ -47,7 +48,7 @@ def folder(bank: Tensor, tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     model = MiniModel.untrained()
     sampler = SceneSampler(bank, 64, 32, 0, bracket=True)
-    weights = train_regressor(model, sampler, Budget(2, 1e-3, warmup=1), folder, batch=2, report=lambda line: None)
+    weights = train_regressor(model, sampler, Budget(2, 1e-3, warmup=1), folder, feed=Feed(2), report=lambda line: None)
     write_networks(folder, weights)
     return folder
 
@@ -128,7 +129,7 @@ def test_training_lowers_the_regressors_error(bank: Tensor, tmp_path: Path) -> N
             told.append((int(step), float(loss)))
 
         budget = Budget(steps, 3e-4, warmup=1)
-        train_regressor(MiniModel.untrained(), sampler, budget, tmp_path / str(steps), batch=2, report=heard)
+        train_regressor(MiniModel.untrained(), sampler, budget, tmp_path / str(steps), feed=Feed(2), report=heard)
         assert told[-1][0] == steps
         return sum(loss * (step - before) for (before, _), (step, loss) in pairwise(told)) / steps
 

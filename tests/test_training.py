@@ -29,6 +29,7 @@ from dl_core.training.decoder import train_decoder
 from dl_core.training.denoiser import OFF_BALL_WEIGHT, draw_batch
 from dl_core.training.drawn_pairs import DrawnPairs
 from dl_core.training.export import write_networks
+from dl_core.training.feed import Ahead, Feed
 from dl_core.training.loop import Budget, train
 from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
 from dl_core.training.procedural import draw_panorama
@@ -131,13 +132,44 @@ def test_a_darker_picture_shows_the_same_light_less_bright(panoramas: Tensor) ->
 
 
 def test_a_batch_mixes_signal_and_noise_as_its_timesteps_say(panoramas: Tensor) -> None:
-    batch = draw_batch(SceneSampler(panoramas, 64, 32, seed=1), 5, 6, full_canvas=128)
-    again = draw_batch(SceneSampler(panoramas, 64, 32, seed=1), 5, 6, full_canvas=128)
+    batch = draw_batch(SceneSampler(panoramas, 64, 32, seed=1), 5, Feed(6), full_canvas=128)
+    again = draw_batch(SceneSampler(panoramas, 64, 32, seed=1), 5, Feed(6), full_canvas=128)
     assert torch.equal(batch.noisy, again.noisy)
     assert batch.noisy.shape == (6, 4, 16, 16)
     assert batch.balls[0].canvas == 128
     assert batch.weights.min() == pytest.approx(OFF_BALL_WEIGHT)
     assert batch.weights.max() == pytest.approx(1.0)
+
+
+def test_a_picture_shown_at_several_levels_of_noise_is_drawn_once(panoramas: Tensor) -> None:
+    sampler = SceneSampler(panoramas, 64, 32, seed=1)
+    often, once = (draw_batch(sampler, 5, Feed(size, noises), full_canvas=128) for size, noises in ((6, 3), (2, 1)))
+    assert often.balls == tuple(ball for ball in once.balls for _ in range(3))
+    assert torch.equal(often.captions, once.captions.repeat_interleave(3))
+    assert len(often.timesteps.unique()) == 6
+    schedule = DDPMScheduler(**SCHEDULER_CONFIG)
+    kept = schedule.alphas_cumprod[often.timesteps].view(-1, 1, 1, 1)
+    # z = sqrt(ᾱ) z_t - sqrt(1 - ᾱ) v, whatever the noise was.
+    clean = kept.sqrt() * often.noisy - (1 - kept).sqrt() * often.target
+    torch.testing.assert_close(clean, clean[::3].repeat_interleave(3, dim=0), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("start", [0, 4])
+def test_batches_drawn_ahead_are_those_drawn_in_turn(panoramas: Tensor, start: int) -> None:
+    sampler = SceneSampler(panoramas, 64, 32, seed=1)
+    ahead, in_turn = (Ahead(lambda step: draw_batch(sampler, step, Feed(4, 2), full_canvas=128), n) for n in (2, 0))
+    for step in (*range(start, start + 5), start):  # the last as after a restart
+        for name, value in vars(in_turn(step)).items():
+            drawn = getattr(ahead(step), name) if name == "noisy" else None
+            assert drawn is None or torch.equal(drawn, value)
+
+
+@pytest.mark.parametrize(
+    ("feed", "named"), [((0,), "batch"), ((4, 3), "noises"), ((4, 0), "noises"), ((4, 2, -1), "loaders")]
+)
+def test_feeds_that_make_no_sense_are_refused(feed: tuple[int, ...], named: str) -> None:
+    with pytest.raises(OptionError, match=named):
+        Feed(*feed)
 
 
 @pytest.mark.parametrize("steps", [6, 10, 30])
@@ -180,7 +212,7 @@ def test_where_a_sampler_starts_a_ball_is_noise_alone_and_the_photograph_is_not(
     # The same draws in two worlds: what differs between the batches comes from the pictures.
     monkeypatch.setattr("dl_core.training.denoiser.draw_starts", lambda levels, generator: levels)
     one, other = (
-        draw_batch(SceneSampler(light, 64, 32, seed=1, centred=1.0), 0, 24, full_canvas=128)
+        draw_batch(SceneSampler(light, 64, 32, seed=1, centred=1.0), 0, Feed(24), full_canvas=128)
         for light in (panoramas, panoramas.flip(-1))
     )
     assert torch.equal(one.timesteps, other.timesteps)
@@ -278,6 +310,7 @@ def test_the_stage_lora_writes_a_lora_of_attentions_that_loads_into_the_painter(
         stage="lora", out=folder, work=tmp_path / "work", panoramas=None, scenes=scenes, steps=2, batch=1
     )
     options.learning_rate, options.seed, options.go_on, options.mixed_precision = 1e-3, 1, False, "no"
+    options.noises, options.loaders, options.real_share = 1, 0, 0.5
     assert run_stage(options, lambda text: None) == [folder / LORA_FILE]
     model = load_mini(folder)
     assert model.lora is not None
@@ -348,7 +381,7 @@ def test_control_training_wakes_the_controlnet_and_gives_a_whole_one(panoramas: 
     torch.manual_seed(0)
     model = MiniModel.untrained()
     sampler = SceneSampler(panoramas, 128, 64, seed=1)
-    weights = train_control(model, sampler, Budget(3, 1e-3, warmup=1), tmp_path, batch=1, report=lambda text: None)
+    weights = train_control(model, sampler, Budget(3, 1e-3, warmup=1), tmp_path, feed=Feed(1), report=lambda text: None)
     fresh = MiniModel.untrained()
     fresh.controlnet.load_state_dict(weights["controlnet"])
     fresh.unet.load_state_dict(weights["unet"])

@@ -27,6 +27,7 @@ BENCHES: Final[dict[str, Subcommand]] = {
     "stability": Subcommand("where the method fails, and what it depends on", f"{__package__}.stability.command"),
     "mend": Subcommand("what options around an estimate gain", f"{__package__}.mend"),
     "protocol": Subcommand("score given maps by the paper's protocols", f"{__package__}.protocol"),
+    "full-size": Subcommand("what SDXL takes on this machine, random weights", f"{__package__}.full_size"),
     "lights": Subcommand("how small a light stands for a map, and how long it takes to find", f"{__package__}.lights"),
 }
 """The benches by name; a new one is a new row."""

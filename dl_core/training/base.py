@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..backends.mini import MiniModel
 from .denoiser import TextBank, draw_batch, spell_out_attention, time_ids, velocity_loss
-from .loop import Budget, train
+from .feed import Ahead, Feed
+from .loop import Budget, train, training_device
 from .scenes import SceneSampler
 
 __all__ = ["train_base", "wake_text_encoders"]
@@ -22,7 +23,7 @@ def train_base(
     budget: Budget,
     folder: Path,
     *,
-    batch: int,
+    feed: Feed,
     fresh: bool = True,
     report: Callable[[str], None],
 ) -> dict[str, dict[str, Tensor]]:
@@ -33,29 +34,32 @@ def train_base(
         sampler: draws the pictures.
         budget: steps and learning rate.
         folder: for checkpoints and the log.
-        batch: pictures a step.
+        feed: what a step is given.
         fresh: whether the networks have their random start, rather than weights to go on from.
         report: told of progress.
 
     Returns:
         Averaged weights by network name.
     """
+    device = training_device()
+    networks = {name: getattr(model, name).train().to(device) for name in ("unet", "text_encoder", "text_encoder_2")}
     spell_out_attention(model.unet)
     bank = TextBank(model)
     side = model.defaults.canvas
+    batches = Ahead(lambda step: draw_batch(sampler, step, feed, full_canvas=side), feed.loaders)
+    sizes = time_ids(feed.batch, side).to(device)
 
     def loss_of_step(step: int) -> Tensor:
-        drawn = draw_batch(sampler, step, batch, full_canvas=side)
+        drawn = batches(step).to(device)
         tokens, pooled = bank.embed()
         predicted = model.unet(
             drawn.noisy,
             drawn.timesteps,
             tokens[drawn.captions],
-            added_cond_kwargs={"text_embeds": pooled[drawn.captions], "time_ids": time_ids(batch, side)},
+            added_cond_kwargs={"text_embeds": pooled[drawn.captions], "time_ids": sizes},
         ).sample
         return velocity_loss(predicted, drawn)
 
-    networks = {name: getattr(model, name).train() for name in ("unet", "text_encoder", "text_encoder_2")}
     if fresh and not (folder / "checkpoint.pt").is_file():
         wake_text_encoders(model)
     return train(networks, loss_of_step, budget, folder, report=report)
@@ -67,4 +71,4 @@ def wake_text_encoders(model: MiniModel) -> None:
     generator = torch.Generator().manual_seed(49408)
     for encoder in (model.text_encoder, model.text_encoder_2):
         embeddings = encoder.get_input_embeddings().weight
-        embeddings.copy_(0.5 * torch.randn(embeddings.shape, generator=generator))
+        embeddings.copy_(0.5 * torch.randn(embeddings.shape, generator=generator).to(embeddings))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,8 +15,9 @@ from torch import Generator, Tensor
 
 from ..backends.mini import MiniModel
 from ..ball import Ball, paint_depth
-from .denoiser import TextBank, draw_batch, spell_out_attention, time_ids, velocity_loss
-from .loop import Budget, train
+from .denoiser import Batch, TextBank, draw_batch, spell_out_attention, time_ids, velocity_loss
+from .feed import Ahead, Feed
+from .loop import Budget, train, training_device
 from .scenes import SceneSampler
 
 __all__ = ["train_control"]
@@ -25,6 +26,8 @@ WITHOUT: Final = 0.1
 """Share of steps without the ControlNet, so that the base still works alone."""
 NOISIEST: Final = 0.75
 """Share of the noisiest levels: there the ball's place and the scene's light are settled."""
+BLACK: Final = 0.85
+"""Share of depth maps with nothing behind the ball."""
 _HINT: Final = "controlnet_cond_embedding."
 
 
@@ -34,7 +37,7 @@ def train_control(
     budget: Budget,
     folder: Path,
     *,
-    batch: int,
+    feed: Feed,
     fresh: bool = True,
     report: Callable[[str], None],
 ) -> dict[str, dict[str, Tensor]]:
@@ -51,58 +54,80 @@ def train_control(
     control: Any = model.controlnet
     if fresh:
         control.load_state_dict(ControlNetModel.from_unet(model.unet).state_dict(), strict=False)
-    for network in (model.unet, control):
+    side, device = model.defaults.canvas, training_device()
+    with torch.no_grad():
+        tokens, pooled = (embedding.to(device) for embedding in TextBank(model).embed())
+    networks = {"unet": model.unet.train().to(device), "controlnet": control.train().to(device)}
+    for network in networks.values():
         spell_out_attention(network)
     looking = control.controlnet_cond_embedding
-    features = _Features(looking)
-    # The trained part takes features in place of a picture, so that those of the usual ball are computed once.
+    # The trained part takes features in place of a picture, so that each depth map is looked at once a step.
     control.controlnet_cond_embedding = looking.conv_out
-    side = model.defaults.canvas
-    with torch.no_grad():
-        tokens, pooled = TextBank(model).embed()
+    batches = Ahead(lambda step: _draw(sampler, step, feed, side), feed.loaders)
+    sizes = time_ids(feed.batch, side).to(device)
 
     def loss_of_step(step: int) -> Tensor:
-        drawn = draw_batch(sampler, step, batch, full_canvas=side, noisiest=NOISIEST)
-        generator = torch.Generator().manual_seed(sampler.seed * 104_729 + step)
-        text = {"encoder_hidden_states": tokens[drawn.captions]}
-        added = {"text_embeds": pooled[drawn.captions], "time_ids": time_ids(batch, side)}
+        drawn = batches(step)
+        batch = drawn.batch.to(device)
+        text = {"encoder_hidden_states": tokens[batch.captions]}
+        added = {"text_embeds": pooled[batch.captions], "time_ids": sizes}
         residuals = {}
-        if float(torch.rand((), generator=generator)) >= WITHOUT:
-            hints = torch.cat([features.of(ball, generator) for ball in drawn.balls])
+        if drawn.depths is not None:
+            hints = _see(looking, drawn.depths.to(device))[drawn.shown.to(device)]
             down, middle = control(
-                drawn.noisy, drawn.timesteps, controlnet_cond=hints, added_cond_kwargs=added, return_dict=False, **text
+                batch.noisy, batch.timesteps, controlnet_cond=hints, added_cond_kwargs=added, return_dict=False, **text
             )
             residuals = {"down_block_additional_residuals": down, "mid_block_additional_residual": middle}
         unet: Any = model.unet
-        predicted = unet(drawn.noisy, drawn.timesteps, added_cond_kwargs=added, **residuals, **text).sample
-        return velocity_loss(predicted, drawn)
+        predicted = unet(batch.noisy, batch.timesteps, added_cond_kwargs=added, **residuals, **text).sample
+        return velocity_loss(predicted, batch)
 
-    networks = {"unet": model.unet.train(), "controlnet": control.train()}
     averaged = train(networks, loss_of_step, budget, folder, report=report)
     control.controlnet_cond_embedding = looking
     trained = {key.replace(_HINT, _HINT + "conv_out."): value for key, value in averaged["controlnet"].items()}
     return {"unet": averaged["unet"], "controlnet": {**control.state_dict(), **trained}}
 
 
-class _Features:
+@dataclass(frozen=True)
+class _Drawn:
+    """A batch with its depth maps.
+
+    Attributes:
+        batch: noisy latents.
+        depths: (K, S, S) in 8 bits, each different one once; None in a step without the ControlNet.
+        shown: (B,) which of them goes with each example.
+    """
+
+    batch: Batch
+    depths: Tensor | None
+    shown: Tensor
+
+
+def _draw(sampler: SceneSampler, step: int, feed: Feed, side: int) -> _Drawn:
+    """The batch of a step. Mostly nothing is behind a ball, else ground that comes nearer downwards."""
+    batch = draw_batch(sampler, step, feed, full_canvas=side, noisiest=NOISIEST)
+    generator = torch.Generator().manual_seed(sampler.seed * 104_729 + step)
+    if float(torch.rand((), generator=generator)) < WITHOUT:
+        return _Drawn(batch, None, torch.zeros(feed.batch, dtype=torch.long))
+    depths: list[Tensor] = []
+    of_black: dict[Ball, int] = {}
+    shown = []
+    for ball in batch.balls[:: feed.noises]:
+        black = float(torch.rand((), generator=generator)) < BLACK
+        if not black or ball not in of_black:
+            depths.append(paint_depth(None, ball) if black else _ground(ball, generator))
+        shown.append(of_black.setdefault(ball, len(depths) - 1) if black else len(depths) - 1)
+    codes = (torch.cat(depths)[..., 0] * 255).round().to(torch.uint8)
+    return _Drawn(batch, codes, torch.tensor(shown).repeat_interleave(feed.noises))
+
+
+@torch.no_grad()
+def _see(looking: Any, depths: Tensor) -> Float[Tensor, "k c m m"]:
     """What the ControlNet's untrained first layers see of depth maps."""
-
-    def __init__(self, looking: Any) -> None:
-        self._looking = looking
-        self._of_black = lru_cache(maxsize=64)(lambda ball: self._see(paint_depth(None, ball)))
-
-    def of(self, ball: Ball, generator: Generator) -> Float[Tensor, "1 c m m"]:
-        """Features of a depth map with the ball: mostly nothing behind it, else ground that comes nearer downwards."""
-        if float(torch.rand((), generator=generator)) < 0.85:
-            return self._of_black(ball)
-        return self._see(_ground(ball, generator))
-
-    @torch.no_grad()
-    def _see(self, depth: Float[Tensor, "1 s s 3"]) -> Float[Tensor, "1 c m m"]:
-        seen = F.silu(self._looking.conv_in(depth.permute(0, 3, 1, 2)))
-        for layer in self._looking.blocks:
-            seen = F.silu(layer(seen))
-        return seen
+    seen = F.silu(looking.conv_in((depths.float() / 255)[:, None].expand(-1, 3, -1, -1)))
+    for layer in looking.blocks:
+        seen = F.silu(layer(seen))
+    return seen
 
 
 def _ground(ball: Ball, generator: Generator) -> Float[Tensor, "1 s s 3"]:

@@ -9,7 +9,7 @@ The ball's latents are those that a sampler which started from noise alone meets
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from torch import Tensor
 from ..backends.mini import SCHEDULER_CONFIG, MiniModel
 from ..ball import Ball, disc_mask
 from .autoencoder import block_latents
+from .feed import Feed
 from .scenes import BASE_CAPTIONS, SceneSampler
 from .starts import carried_noise, draw_starts
 
@@ -64,6 +65,13 @@ class Batch:
     evs: Float[Tensor, "b"]
     balls: tuple[Ball, ...]
 
+    def to(self, device: torch.device) -> Batch:
+        """The same on a device."""
+        tensors: dict[str, Any] = {
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **tensors)
+
 
 class TextBank:
     """Embeddings of the few captions training uses, in the form SDXL's UNet takes them."""
@@ -77,17 +85,21 @@ class TextBank:
 
     def embed(self) -> tuple[Float[Tensor, "k 77 c"], Float[Tensor, "k p"]]:
         """Token embeddings (penultimate layers of both encoders) and pooled embeddings of all captions."""
-        first = self.model.text_encoder(self.tokens[0].input_ids, output_hidden_states=True)
-        second = self.model.text_encoder_2(self.tokens[1].input_ids, output_hidden_states=True)
+        encoders = (self.model.text_encoder, self.model.text_encoder_2)
+        first, second = (
+            encoder(tokens.input_ids.to(encoder.device), output_hidden_states=True)
+            for encoder, tokens in zip(encoders, self.tokens, strict=True)
+        )
         return torch.cat((first.hidden_states[-2], second.hidden_states[-2]), dim=-1), second.text_embeds
 
 
 def spell_out_attention(network: Any) -> None:
-    """Let a UNet or ControlNet compute attention by plain products instead of the fused kernel.
+    """Let a UNet or ControlNet on a CPU compute attention by plain products instead of the fused kernel.
 
     The mini model attends over 16 or 64 latents, where the fused kernel's way back costs a CPU a sixth of a step.
     """
-    network.set_attn_processor(AttnProcessor())
+    if network.device.type == "cpu":
+        network.set_attn_processor(AttnProcessor())
 
 
 def time_ids(count: int, side: int) -> Float[Tensor, "b 6"]:
@@ -95,20 +107,23 @@ def time_ids(count: int, side: int) -> Float[Tensor, "b 6"]:
     return torch.tensor([[side, side, 0, 0, side, side]], dtype=torch.float32).expand(count, -1)
 
 
-def draw_batch(sampler: SceneSampler, step: int, size: int, *, full_canvas: int, noisiest: float = 0.5) -> Batch:
+def draw_batch(sampler: SceneSampler, step: int, feed: Feed, *, full_canvas: int, noisiest: float = 0.5) -> Batch:
     """The batch of a step; it follows from the sampler's seed and the step alone.
 
     Args:
         sampler: draws the pictures.
         step: of the training.
-        size: pictures in the batch.
+        feed: examples in the batch, and how many are made of a picture; those follow each other.
         full_canvas: side of the canvas the model paints on; the sampler's may be smaller.
         noisiest: share drawn from the noisiest 40% of levels, where the layout of light is settled; the rest are
             spread over all.
     """
     scale = full_canvas // sampler.canvas
-    pictures = [sampler.draw(step * size + i) for i in range(size)]
-    clean = block_latents(torch.cat([picture.canvas_ldr for picture in pictures]), 8 // scale)
+    size, count = feed.batch, feed.batch // feed.noises
+    drawn = [sampler.draw(step * count + i) for i in range(count)]
+    clean = block_latents(torch.cat([picture.canvas_ldr for picture in drawn]), 8 // scale)
+    clean = clean.repeat_interleave(feed.noises, dim=0)
+    pictures = [picture for picture in drawn for _ in range(feed.noises)]
     generator = torch.Generator().manual_seed(sampler.seed * 7_919 + step)
     levels = torch.randint(0, 1000, (size,), generator=generator)
     high_levels = torch.randint(600, 1000, (size,), generator=generator)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from ..errors import Interrupted, OptionError
 
-__all__ = ["Budget", "average_weights", "train"]
+__all__ = ["Budget", "average_weights", "train", "training_device"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,12 @@ class Budget:
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
 
 
+def training_device() -> torch.device:
+    """Where networks are trained: this process's GPU if there is one."""
+    device: torch.device = PartialState(cpu=not torch.cuda.is_available()).device
+    return device
+
+
 @torch.no_grad()
 def average_weights(averages: Sequence[Tensor], weights: Sequence[Tensor], step: int, horizon: float = 0.998) -> None:
     """Move exponential averages of weights towards the current ones; early steps are forgotten faster."""
@@ -82,7 +88,7 @@ def train(
     """Train networks until the budget is used, resuming from the folder's checkpoint if there is one.
 
     Args:
-        networks: what is trained; parameters without `requires_grad` stay as they are.
+        networks: what is trained, on `training_device`; parameters without `requires_grad` stay as they are.
         loss_of_step: the loss of a batch, by its number; it must follow from the number alone, so that a resumed run
             sees what the killed one would have seen. There is a batch per step and process.
         budget: steps and learning rate.
@@ -107,7 +113,7 @@ def train(
     averages = {name: parameter.detach().clone() for name, parameter in trained.items()}
     step = _resume(folder, networks, optimizer, averages)
     processes = PartialState(cpu=not torch.cuda.is_available())
-    losses: list[float] = []
+    losses: list[Tensor] = []
     spoken = saved = started = time.monotonic()
     try:
         while step < budget.steps:
@@ -125,11 +131,12 @@ def train(
             average_weights(tuple(averages.values()), weights, step)
             if not processes.is_main_process:
                 continue
-            losses.append(float(loss.detach()))
+            losses.append(loss.detach())  # to read it would wait for the GPU
             now = time.monotonic()
             if now - spoken > 10 or step == budget.steps:
-                _log(folder, step, losses, now - started)
-                report(f"step {step}/{budget.steps}  loss {sum(losses) / len(losses):.4f}")
+                mean = float(torch.stack(losses).mean())
+                _log(folder, step, mean, now - started)
+                report(f"step {step}/{budget.steps}  loss {mean:.4f}")
                 losses, spoken = [], now
             if now - saved > budget.checkpoint_seconds:
                 _save(folder, step, networks, optimizer, averages)
@@ -150,9 +157,9 @@ def _averaged(networks: Mapping[str, nn.Module], averages: Mapping[str, Tensor])
     }
 
 
-def _log(folder: Path, step: int, losses: list[float], seconds: float) -> None:
+def _log(folder: Path, step: int, loss: float, seconds: float) -> None:
     with (folder / "log.jsonl").open("a") as log:
-        log.write(json.dumps({"step": step, "loss": sum(losses) / len(losses), "seconds": round(seconds, 1)}) + "\n")
+        log.write(json.dumps({"step": step, "loss": loss, "seconds": round(seconds, 1)}) + "\n")
 
 
 def _save(
@@ -179,7 +186,7 @@ def _resume(
     path = folder / "checkpoint.pt"
     if not path.is_file():
         return 0
-    state: dict[str, Any] = torch.load(path, weights_only=True)
+    state: dict[str, Any] = torch.load(path, weights_only=True, map_location=training_device())
     for name, network in networks.items():
         network.load_state_dict(state["networks"][name])
     optimizer.load_state_dict(state["optimizer"])

@@ -58,6 +58,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, help="folder of the mini model's files (default: the package's own)")
     add("--steps", type=int, help="optimizer steps (default: the stage's)")
     add("--batch", type=int, default=8, help="pictures a step (default: 8)")
+    add("--noises", type=int, default=1, help="examples of a step made of each picture (default: 1; base, control)")
+    add(
+        "--loaders",
+        type=int,
+        default=0,
+        help="processes that draw pictures ahead of a GPU (default: 0; base, control, regressor)",
+    )
+    add(
+        "--real-share",
+        type=float,
+        default=0.5,
+        help="share of pictures in maps of --panoramas where there are --scenes too (default: 0.5)",
+    )
     add("--learning-rate", type=float, help="peak learning rate (default: the stage's)")
     add("--seed", type=int, default=1, help="of weights and pictures (default: 1)")
     add(

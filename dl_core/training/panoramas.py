@@ -146,28 +146,32 @@ def draw_scenes(folder: Path, kind: str, count: int, height: int, *, report: Cal
             report(f"{path.name}: {seed + 1}/{count}")
 
 
-def load_panoramas(folder: Path | None, scenes: Path | None, *, height: int) -> Latlong:
+def load_panoramas(folder: Path | None, scenes: Path | None, *, height: int, real_share: float = 0.5) -> Latlong:
     """The training bank: the training split of `folder` and the procedural scenes in `scenes`.
 
-    Real maps are repeated until they are about as many as the others, so that a uniform draw sees both equally.
+    Real maps are repeated until they are about their share of all, so that a uniform draw sees that share of them.
 
     Args:
         folder: HDR maps with a manifest; None for procedural scenes only.
         scenes: folder of `draw_scenes`; None for real maps only.
         height: rows of every map of the bank.
+        real_share: of draws, between 0 and 1.
 
     Returns:
         (N, height, 2 height, 3) linear radiance.
 
     Raises:
-        OptionError: neither is given, or a folder holds nothing of use.
+        OptionError: neither is given, a folder holds nothing of use, or a share out of range.
         ImageError: a map that cannot be read.
     """
     drawn_files = sorted(path for kind in KINDS for path in scenes.glob(f"{kind}_*.exr")) if scenes is not None else []
     real_files = panorama_files(folder, "training") if folder is not None else []
     if not drawn_files and not real_files:
         raise OptionError("panoramas", str(folder), "a folder of HDR maps, or scenes made by `lightprobe train scenes`")
-    repeats = max(1, len(drawn_files) // max(1, len(real_files)))
+    if not 0 < real_share < 1:
+        raise OptionError("real share", real_share, "between 0 and 1")
+    wanted = len(drawn_files) * real_share / (1 - real_share)
+    repeats = max(1, round(wanted / max(1, len(real_files))))
     real, drawn = (
         [reduce_panorama(read_envmap(path), height) for path in files] for files in (real_files, drawn_files)
     )

@@ -19,6 +19,7 @@ from .decoder import train_decoder
 from .drawn_pairs import DrawnPairs
 from .export import write_networks
 from .exposure_lora import train_exposure_loras
+from .feed import Feed
 from .loop import Budget
 from .lora_base import LoraBase
 from .lora_settings import LORA_SETTINGS
@@ -51,10 +52,18 @@ def _sampler(
     args: argparse.Namespace, model: MiniModel, *, scale: int = SKETCH, bracket: bool = False, centred: float = 0.7
 ) -> SceneSampler:
     rows = SKETCH_ROWS if scale == SKETCH else SCENE_ROWS
-    bank = load_panoramas(args.panoramas, args.scenes, height=rows)
+    bank = load_panoramas(args.panoramas, args.scenes, height=rows, real_share=args.real_share)
     canvas, diameter = model.defaults.canvas // scale, model.defaults.diameter // scale
     ev_min = model.defaults.ev_min
     return SceneSampler(bank, canvas, diameter, args.seed, bracket=bracket, centred=centred, ev_min=ev_min)
+
+
+def _feed(args: argparse.Namespace) -> Feed:
+    if args.noises > 1 and args.stage not in GOING_ON:
+        raise OptionError("--noises", args.noises, "1 for all stages but " + " and ".join(GOING_ON))
+    if args.loaders and args.stage not in (*GOING_ON, "regressor"):
+        raise OptionError("--loaders", args.loaders, "0 for all stages but base, control and regressor")
+    return Feed(args.batch, args.noises, args.loaders)
 
 
 def _budget(args: argparse.Namespace) -> Budget:
@@ -72,7 +81,7 @@ def _base(args: argparse.Namespace, report: Report) -> list[Path]:
     model = load_mini(args.out, without=("controlnet",)) if args.go_on else MiniModel.untrained(args.out)
     sampler = _sampler(args, model)
     weights = train_base(
-        model, sampler, _budget(args), args.work / "base", batch=args.batch, fresh=not args.go_on, report=report
+        model, sampler, _budget(args), args.work / "base", feed=_feed(args), fresh=not args.go_on, report=report
     )
     return write_networks(args.out, weights)
 
@@ -81,7 +90,7 @@ def _control(args: argparse.Namespace, report: Report) -> list[Path]:
     model = load_mini(args.out, without=() if args.go_on else ("controlnet",))
     sampler = _sampler(args, model, centred=0.85)
     weights = train_control(
-        model, sampler, _budget(args), args.work / "control", batch=args.batch, fresh=not args.go_on, report=report
+        model, sampler, _budget(args), args.work / "control", feed=_feed(args), fresh=not args.go_on, report=report
     )
     return write_networks(args.out, weights)
 
@@ -94,7 +103,7 @@ def _mean(args: argparse.Namespace, report: Report) -> list[Path]:
 def _regressor(args: argparse.Namespace, report: Report) -> list[Path]:
     model = MiniModel.untrained(args.out)
     sampler = _sampler(args, model, bracket=True)
-    weights = train_regressor(model, sampler, _budget(args), args.work / "regressor", batch=args.batch, report=report)
+    weights = train_regressor(model, sampler, _budget(args), args.work / "regressor", feed=_feed(args), report=report)
     return write_networks(args.work / "regressor", weights)
 
 
@@ -138,5 +147,6 @@ def run_stage(args: argparse.Namespace, report: Report) -> list[Path]:
     require_work_folder(args.work)
     if args.go_on and args.stage not in GOING_ON:
         raise OptionError("--go-on", args.stage, "the stages " + " and ".join(GOING_ON))
+    _feed(args)
     torch.manual_seed(args.seed)  # random starts: a resumed run builds the same ones
     return _STAGES[args.stage](args, report)
