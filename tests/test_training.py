@@ -23,6 +23,7 @@ from dl_core.ball import disc_mask
 from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
 from dl_core.geometry import latlong_energy
+from dl_core.imageio import write_exr
 from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
 from dl_core.training.control import train_control
 from dl_core.training.decoder import train_decoder
@@ -331,6 +332,19 @@ def test_scenes_are_drawn_once_and_read_back(tmp_path: Path) -> None:
     bank = load_panoramas(None, tmp_path, height=16)
     # Half floats keep 11 bits.
     torch.testing.assert_close(bank[2:3], draw_panorama(2, 16), rtol=2**-10, atol=1e-6)
+
+
+def test_real_maps_are_drawn_as_often_as_asked_for(tmp_path: Path) -> None:
+    draw_scenes(tmp_path / "scenes", "drawn", 6, 16, report=lambda text: None)
+    real = tmp_path / "real"
+    real.mkdir()
+    (real / "manifest.json").write_text('[{"file": "a.exr", "split": "training"}]')
+    write_exr(real / "a.exr", torch.full((16, 32, 3), 7.0), metadata={})
+    for share, maps in ((0.25, 2), (0.5, 6), (0.75, 18)):
+        bank = load_panoramas(real, tmp_path / "scenes", height=16, real_share=share)
+        assert int((bank == 7).all(dim=3).all(dim=2).all(dim=1).sum()) == maps
+    with pytest.raises(OptionError, match="real share"):
+        load_panoramas(real, tmp_path / "scenes", height=16, real_share=1.0)
 
 
 def test_folders_without_panoramas_are_refused(tmp_path: Path) -> None:
