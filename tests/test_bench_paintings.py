@@ -158,6 +158,18 @@ def test_maps_compared_as_pictures_are_toned_by_their_own_light(
     assert both["rmse"] < 0.2 * base["rmse"]
 
 
+def test_a_last_ball_is_painted_where_the_preset_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = lamp(tmp_path).parent
+    words = ("three-spheres", "--panoramas", folder, "--painter", "perfect", "--preset", "draft", "--out")
+    without, ending = (
+        protocol(capsys, *words, tmp_path / name, *more) for name, more in (("a", ()), ("b", ("--last-ball",)))
+    )
+    assert (without["protocol"]["last_ball"], ending["protocol"]["last_ball"]) == (False, True)
+    rounds = PRESETS["draft"].rounds
+    # One ball an exposure, two evaluations for each step of SDEdit.
+    assert ending["evaluations"] - without["evaluations"] == 3 * 2 * round(rounds.strength * rounds.steps)
+
+
 def test_the_array_stands_beside_the_papers_table_and_a_bracket_beats_one_exposure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--baselines", help=f"rows to compare with: {','.join(BASELINES)}, or all (default: none)")
     add("--regressor", type=Path, metavar="DIR", help="the regressor's files, of `lightprobe train mini regressor`")
     add("--preset", default="draft", help="schedule and bracket (default: draft)")
+    add(
+        "--last-ball",
+        action="store_true",
+        help="paint a last ball from the median, as the paper does, also where the preset ends in the median",
+    )
     add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
     add_files(group)
 
@@ -57,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
     compared = _names(args.baselines, BASELINES, "--baselines") if args.baselines else []
     answers = list(planned(panoramas, args.protocol, compared, args.seed))
     chosen = preset(args.preset)
+    if args.last_ball:
+        chosen = replace(chosen, rounds=replace(chosen.rounds, final=True))
     prepare_output(args)
     started = time.perf_counter()
     files = ModelFiles.of(args)
@@ -110,6 +117,7 @@ def _description(args: argparse.Namespace, settings: Settings, chosen: Preset) -
         "convention": args.convention,
         "painter": args.painter,
         "preset": args.preset,
+        "last_ball": chosen.rounds.final,
         "merge": settings.merge,
         "evs": list(chosen.evs),
         "canvas_px": settings.canvas,
