@@ -1,10 +1,11 @@
 """`lightprobe bench confidence`: whether an estimate knows how wrong it is.
 
 Photographs are taken inside each panorama from several cameras, their light is estimated, and the error that the
-estimate expects of itself is compared with the one it has: over photographs by the rank correlation of the share of
-light misplaced, and over the directions of each map by what share of the worst tenth lies in the fifth that is trusted
-least. Directions are compared in radiance, for that is what lights a render, and in stops, in which a dark corner
-counts as much as a lamp.
+estimate expects of itself is compared with the one it has: by rank correlations over photographs and over all
+directions of all of them, and over the directions of each map by what share of the worst tenth lies in the fifth that
+is trusted least. Errors are compared in radiance, the photograph's white being 1, for that is what lights a render;
+in stops, in which a dark corner counts as much as a lamp; and as the share of the scene's light that is misplaced,
+which a scene's brightness does not enter.
 
 With `--calibrate FILE` the weights of the evidence are fitted to the errors and written to the file. Figures of a run
 that calibrates are on its own maps; run it again on others, with `--calibration FILE`.
@@ -120,13 +121,14 @@ def run(args: argparse.Namespace) -> None:
     if calibration is None:
         calibration = _calibrate(measured, args)
     rows = [_judged(row, calibration) for row in measured]
-    summary = _summary(rows)
+    summary = _summary(rows, _over_directions(measured, calibration))
     protocol = {
         "painter": args.painter,
         "preset": args.preset,
         "cameras": "drawn for each panorama: fov 30 to 150, elevation -45 to 45, any azimuth",
         "misplaced": "∫ |estimate - truth| dω / ∫ truth dω, of luminances",
-        "error": f"mean over RGB of |log2| of estimate to truth, each plus {FLOOR:g}; maps of {ROWS} rows",
+        "error in radiance": "|estimate - truth| of luminances, the photograph's white at EV 0 being 1",
+        "error in stops": f"mean over RGB of |log2| of estimate to truth, each plus {FLOOR:g}; maps of {ROWS} rows",
         "weights": dict(zip(EVIDENCE, calibration.weights, strict=True)),
         "overall": None if calibration.overall is None else dict(zip(OVERALL, calibration.overall, strict=True)),
         "calibrated": "on these maps" if args.calibrate else f"on {calibration.measured_on}",
@@ -191,37 +193,58 @@ def _weights(values: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(round(float(value), 4) for value in values)
 
 
+def _doubt(row: Row, calibration: Calibration) -> NDArray[np.float64]:
+    """Errors of luminance to expect by direction."""
+    expected = np.asarray(calibration.weights) @ np.asarray(row[EVIDENCE_KEY])
+    return np.asarray((np.asarray(row[LEVEL_KEY]) + FLOOR) * (np.exp2(expected) - 1))
+
+
 def _judged(row: Row, calibration: Calibration) -> Row:
     """A photograph's row: its error, what was expected, and how well that is placed."""
-    shares, errors, level = direction_shares(), np.asarray(row[ERROR_KEY]), np.asarray(row[LEVEL_KEY])
+    shares, errors, missed = direction_shares(), np.asarray(row[ERROR_KEY]), np.asarray(row[DIFFERENCE_KEY])
     expected = np.asarray(calibration.weights) @ np.asarray(row[EVIDENCE_KEY])
-    doubt = (level + FLOOR) * (np.exp2(expected) - 1)
+    doubt = _doubt(row, calibration)
     predicted = None
     if calibration.overall is not None:
         predicted = float(np.exp2(np.asarray(calibration.overall) @ np.asarray(row[OVERALL_KEY])))
     return {
         **{key: row[key] for key in ("panorama", "camera", "evaluations", "misplaced")},
         "expected_misplaced": predicted,
+        "error_radiance": float(shares @ missed),
+        "expected_error_radiance": float(shares @ doubt),
         "error_stops": float(shares @ errors),
         "expected_error_stops": float(shares @ expected),
-        "worst_tenth_in_least_trusted_fifth": held_by_least_trusted(doubt, np.asarray(row[DIFFERENCE_KEY]), shares),
+        "worst_tenth_in_least_trusted_fifth": held_by_least_trusted(doubt, missed, shares),
         "worst_tenth_in_least_trusted_fifth_stops": held_by_least_trusted(expected, errors, shares),
     }
 
 
-def _summary(rows: Sequence[Row]) -> list[Row]:
+def _over_directions(measured: Sequence[Row], calibration: Calibration) -> float | None:
+    """Rank correlation of expected and actual errors of luminance over all directions of all photographs."""
+    doubts = np.concatenate([_doubt(row, calibration) for row in measured])
+    return _number(rank_correlation(doubts.tolist(), [value for row in measured for value in row[DIFFERENCE_KEY]]))
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _summary(rows: Sequence[Row], over_directions: float | None) -> list[Row]:
     def over(key: str) -> list[float]:
         return [row[key] for row in rows if row[key] is not None]
 
-    means = ("misplaced", "expected_misplaced", "error_stops", "expected_error_stops", *_HELD)
+    errors = ("misplaced", "error_radiance", "error_stops")
+    means = (*errors, *(f"expected_{key}" for key in errors), *_HELD)
+    names = ("rank_correlation", "rank_correlation_radiance", "rank_correlation_stops")
     correlations = {
-        name: rank_correlation(over(f"expected_{key}"), over(key)) if over(f"expected_{key}") else None
-        for name, key in (("rank_correlation", "misplaced"), ("rank_correlation_stops", "error_stops"))
+        name: _number(rank_correlation(over(f"expected_{key}"), over(key))) if over(f"expected_{key}") else None
+        for name, key in zip(names, errors, strict=True)
     }
     return [
         {
             "photographs": len(rows),
-            **{name: None if value is None or math.isnan(value) else value for name, value in correlations.items()},
+            **correlations,
+            "rank_correlation_directions": over_directions,
             **{f"{key}_mean" if key not in _HELD else key: fmean(over(key)) if over(key) else None for key in means},
         }
     ]
@@ -233,6 +256,8 @@ _ROWS: Final = (
     Column("camera", "camera"),
     Column("misplaced", "misplaced", ".2f"),
     Column("expected", "expected_misplaced", ".2f"),
+    Column("error (radiance)", "error_radiance", ".3f"),
+    Column("expected", "expected_error_radiance", ".3f"),
     Column("error (stops)", "error_stops", ".2f"),
     Column("expected", "expected_error_stops", ".2f"),
     Column("worst tenth held", _HELD[0], ".0%"),
@@ -243,6 +268,10 @@ _SUMMARY: Final = (
     Column("misplaced", "misplaced_mean", ".2f"),
     Column("expected", "expected_misplaced_mean", ".2f"),
     Column("rank correlation", "rank_correlation", ".2f"),
+    Column("error (radiance)", "error_radiance_mean", ".3f"),
+    Column("expected", "expected_error_radiance_mean", ".3f"),
+    Column("rank correlation", "rank_correlation_radiance", ".2f"),
+    Column("over directions", "rank_correlation_directions", ".2f"),
     Column("error (stops)", "error_stops_mean", ".2f"),
     Column("expected", "expected_error_stops_mean", ".2f"),
     Column("rank correlation", "rank_correlation_stops", ".2f"),
