@@ -366,7 +366,7 @@ def test_a_varied_painter_samples_and_guides_in_another_way(painter: DiffusersPa
     direct = DiffusersPainter(painter.pipeline, painter.defaults, sampler="euler").paint(short, SilentObserver())
     assert torch.equal(euler.balls, direct.balls)
     for other in (unguided, euler):
-        assert (other.balls - own.balls).abs().max() > 1e-3
+        assert (other.balls - own.balls).abs().max() > 1e-4
     with pytest.raises(OptionError, match="sampler"):
         painter.varied(sampler="none")
 

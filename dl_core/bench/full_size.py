@@ -7,7 +7,6 @@ lora` runs it, beside the bytes computed for it (`training.lora_memory`), and th
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -18,26 +17,11 @@ from statistics import median
 from typing import Any, Final
 
 import torch
-from diffusers import (
-    AutoencoderKL,
-    ControlNetModel,
-    EulerDiscreteScheduler,
-    StableDiffusionXLControlNetInpaintPipeline,
-    UNet2DConditionModel,
-)
-from torch import nn
-from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
-from ..backends.diffusers_painter import PAPER_DEFAULTS, DiffusersPainter
-from ..backends.mini import MINI_FOLDER, MiniModel
-from ..backends.sdxl_files import SDXL_FOLDER
 from ..ball import Ball, paint_depth, place_ball
 from ..errors import OptionError
 from ..painter import PaintRequest
 from ..shapes import Image
-from ..training.exposure_lora import train_exposure_loras
-from ..training.lora_base import LoraBase
-from ..training.lora_memory import step_memory
 from ..training.lora_settings import LoraSettings
 from .report import Column, Report, Row, add_output, prepare_output, publish
 
@@ -99,6 +83,8 @@ def bench_full_size(size: Size, device: torch.device, *, steps: int, evaluations
         steps: of training, 2 or more.
         evaluations: steps of a painting, 2 or more.
     """
+    from ..backends.diffusers_painter import PAPER_DEFAULTS, DiffusersPainter
+
     rows = _training_rows(size, device, steps)
     painter = DiffusersPainter(size.build(device, _precision(device)), PAPER_DEFAULTS)
     return rows + [_painting_row(painter, size.canvas, count, evaluations, device) for count in (1, 4)]
@@ -124,6 +110,11 @@ def _noise_pairs(canvas: int, count: int) -> list[_NoisePair]:
 
 
 def _training_rows(size: Size, device: torch.device, steps: int) -> list[Row]:
+    from ..backends.diffusers_painter import PAPER_DEFAULTS
+    from ..training.exposure_lora import train_exposure_loras
+    from ..training.lora_base import LoraBase
+    from ..training.lora_memory import step_memory
+
     settings = LoraSettings(steps=1, precision="fp16" if device.type == "cuda" else "no", gradient_checkpointing=True)
     pairs = _noise_pairs(size.canvas, settings.batch)
     rows = []
@@ -150,7 +141,7 @@ def _training_rows(size: Size, device: torch.device, steps: int) -> list[Row]:
     return rows
 
 
-def _painting_row(painter: DiffusersPainter, canvas: int, balls: int, steps: int, device: torch.device) -> Row:
+def _painting_row(painter: Any, canvas: int, balls: int, steps: int, device: torch.device) -> Row:
     ball = place_ball(canvas, canvas // 4)
     picture = torch.full((1, canvas, canvas, 3), 0.5)
     request = PaintRequest(picture, paint_depth(None, ball), ball, 0.0, tuple(range(balls)), steps=steps)
@@ -198,61 +189,23 @@ def _silent(line: str) -> None:
     """Nobody waits for a few steps."""
 
 
+# Networks take seconds to import, so they are where they are wanted.
+
+
 def _sdxl(device: torch.device, dtype: torch.dtype) -> Any:
-    """SDXL's pipeline with a depth ControlNet, as `sdxl_files` loads it, with random weights."""
-    with torch.device(device), _DefaultType(dtype):
-        unet = UNet2DConditionModel.from_config(_config("unet"))
-        control = ControlNetModel.from_config(_config("controlnet"))
-        text_encoder = CLIPTextModel(CLIPTextConfig(**_config("text_encoder")))
-        text_encoder_2 = CLIPTextModelWithProjection(CLIPTextConfig(**_config("text_encoder_2")))
-    with torch.device(device):
-        vae = AutoencoderKL.from_config(_config("vae"))
-    vae = vae if vae.config.force_upcast else vae.to(dtype)
-    networks: dict[str, nn.Module] = {
-        "unet": unet,
-        "controlnet": control,
-        "text_encoder": text_encoder,
-        "text_encoder_2": text_encoder_2,
-        "vae": vae,
-    }
-    folder = MINI_FOLDER / "tokenizer"
-    return StableDiffusionXLControlNetInpaintPipeline(
-        **{name: network.eval() for name, network in networks.items()},
-        tokenizer=CLIPTokenizer.from_pretrained(folder),
-        tokenizer_2=CLIPTokenizer.from_pretrained(folder, pad_token="!"),
-        scheduler=EulerDiscreteScheduler.from_config(json.loads(_text("scheduler/scheduler_config.json"))),
-    )
+    from ..backends.random_weights import sdxl_pipeline
+
+    return sdxl_pipeline(device, dtype)
 
 
 def _mini(device: torch.device, dtype: torch.dtype) -> Any:
-    """The mini model's architecture, with random weights."""
-    return DiffusersPainter.from_mini(MiniModel.untrained()).pipeline.to(device, dtype)
+    from ..backends.random_weights import mini_pipeline
+
+    return mini_pipeline(device, dtype)
 
 
 SIZES: Final = {"sdxl": Size(_sdxl, 1024, 1280), "mini": Size(_mini, 256, 32)}
 """Architectures by name."""
-
-
-def _text(file: str) -> str:
-    return (SDXL_FOLDER / file).read_text()
-
-
-def _config(network: str) -> dict[str, Any]:
-    config: dict[str, Any] = json.loads(_text(f"{network}/config.json"))
-    return config
-
-
-class _DefaultType:
-    """Tensors are made in a type: a network of billions of weights never exists in single precision."""
-
-    def __init__(self, dtype: torch.dtype) -> None:
-        self._dtype, self._before = dtype, torch.get_default_dtype()
-
-    def __enter__(self) -> None:
-        torch.set_default_dtype(self._dtype)
-
-    def __exit__(self, *fault: Any) -> None:
-        torch.set_default_dtype(self._before)
 
 
 _ROWS: Final[Sequence[Column]] = (
