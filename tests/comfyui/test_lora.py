@@ -300,5 +300,7 @@ def test_swap_agrees_with_diffusers(
     assert expected.balls.std() > 0.05
     # The painters differ by about as much without LoRAs (bench_parity.py), for what nodes/painter.py says of cells
     # the mask covers partly.
-    assert (found.balls - expected.balls).abs().mean() < 1e-3 < 2e-3 < (other.balls - expected.balls).abs().mean()
+    apart, wrong = (float((brush.balls - expected.balls).abs().mean()) for brush in (found, other))
+    assert apart < 1e-3
+    assert 3 * apart < wrong
     assert found.evaluations == expected.evaluations == ours.evaluations(1, 6, strength) == {1.0: 12, 0.8: 8}[strength]
