@@ -14,11 +14,11 @@ from diffusers import (
     UNet2DConditionModel,
 )
 from torch import nn
-from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
+from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
 from .diffusers_painter import DiffusersPainter
-from .mini import MINI_FOLDER, MiniModel
-from .sdxl_files import SDXL_FOLDER
+from .mini import MiniModel
+from .sdxl_files import SDXL_FOLDER, sdxl_tokenizers
 
 __all__ = ["mini_pipeline", "sdxl_pipeline"]
 
@@ -40,11 +40,9 @@ def sdxl_pipeline(device: torch.device, dtype: torch.dtype) -> Any:
         "text_encoder_2": text_encoder_2,
         "vae": vae,
     }
-    folder = MINI_FOLDER / "tokenizer"
     return StableDiffusionXLControlNetInpaintPipeline(
         **{name: network.eval() for name, network in networks.items()},
-        tokenizer=CLIPTokenizer.from_pretrained(folder),
-        tokenizer_2=CLIPTokenizer.from_pretrained(folder, pad_token="!"),
+        **sdxl_tokenizers(),
         scheduler=EulerDiscreteScheduler.from_config(json.loads(_text("scheduler/scheduler_config.json"))),
     )
 

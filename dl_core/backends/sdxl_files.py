@@ -17,7 +17,7 @@ from transformers import CLIPTokenizer
 from ..errors import ModelError
 from .mini import MINI_FOLDER
 
-__all__ = ["SDXL_FOLDER", "load_base", "load_controlnet"]
+__all__ = ["SDXL_FOLDER", "load_base", "load_controlnet", "sdxl_tokenizers"]
 
 SDXL_FOLDER: Final = Path(__file__).resolve().parent.parent / "data" / "sdxl"
 """SDXL base 1.0 in diffusers' terms, without weights."""
@@ -37,8 +37,7 @@ def load_base(path: Path, dtype: torch.dtype) -> StableDiffusionXLPipeline:
         lambda: StableDiffusionXLPipeline.from_single_file(
             str(path),
             config=str(SDXL_FOLDER),
-            tokenizer=CLIPTokenizer.from_pretrained(_TOKENIZERS),
-            tokenizer_2=CLIPTokenizer.from_pretrained(_TOKENIZERS, pad_token="!"),
+            **sdxl_tokenizers(),
             torch_dtype=dtype,
             local_files_only=True,
         ),
@@ -51,6 +50,14 @@ def load_base(path: Path, dtype: torch.dtype) -> StableDiffusionXLPipeline:
         # SDXL's own autoencoder overflows half precision; the repaired one says in its folder that it does not.
         base.vae.to(torch.float32)
     return base
+
+
+def sdxl_tokenizers() -> dict[str, CLIPTokenizer]:
+    """SDXL's two tokenizers by their names in a pipeline; they differ in what they pad with."""
+    return {
+        "tokenizer": CLIPTokenizer.from_pretrained(_TOKENIZERS),
+        "tokenizer_2": CLIPTokenizer.from_pretrained(_TOKENIZERS, pad_token="!"),
+    }
 
 
 def load_controlnet(path: Path, base: StableDiffusionXLPipeline, dtype: torch.dtype) -> ControlNetModel:

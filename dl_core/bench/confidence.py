@@ -193,17 +193,16 @@ def _weights(values: NDArray[np.float64]) -> tuple[float, ...]:
     return tuple(round(float(value), 4) for value in values)
 
 
-def _doubt(row: Row, calibration: Calibration) -> NDArray[np.float64]:
-    """Errors of luminance to expect by direction."""
-    expected = np.asarray(calibration.weights) @ np.asarray(row[EVIDENCE_KEY])
-    return np.asarray((np.asarray(row[LEVEL_KEY]) + FLOOR) * (np.exp2(expected) - 1))
+def _expected(row: Row, calibration: Calibration) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Errors to expect by direction, in stops and of luminance."""
+    stops = np.asarray(calibration.weights) @ np.asarray(row[EVIDENCE_KEY])
+    return stops, (np.asarray(row[LEVEL_KEY]) + FLOOR) * (np.exp2(stops) - 1)
 
 
 def _judged(row: Row, calibration: Calibration) -> Row:
     """A photograph's row: its error, what was expected, and how well that is placed."""
     shares, errors, missed = direction_shares(), np.asarray(row[ERROR_KEY]), np.asarray(row[DIFFERENCE_KEY])
-    expected = np.asarray(calibration.weights) @ np.asarray(row[EVIDENCE_KEY])
-    doubt = _doubt(row, calibration)
+    expected, doubt = _expected(row, calibration)
     predicted = None
     if calibration.overall is not None:
         predicted = float(np.exp2(np.asarray(calibration.overall) @ np.asarray(row[OVERALL_KEY])))
@@ -221,7 +220,7 @@ def _judged(row: Row, calibration: Calibration) -> Row:
 
 def _over_directions(measured: Sequence[Row], calibration: Calibration) -> float | None:
     """Rank correlation of expected and actual errors of luminance over all directions of all photographs."""
-    doubts = np.concatenate([_doubt(row, calibration) for row in measured])
+    doubts = np.concatenate([_expected(row, calibration)[1] for row in measured])
     return _number(rank_correlation(doubts.tolist(), [value for row in measured for value in row[DIFFERENCE_KEY]]))
 
 

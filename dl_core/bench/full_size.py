@@ -22,7 +22,7 @@ from ..ball import Ball, paint_depth, place_ball
 from ..errors import OptionError
 from ..painter import PaintRequest
 from ..shapes import Image
-from ..training.lora_settings import LoraSettings
+from ..training.lora_settings import LORA_SETTINGS
 from .report import Column, Report, Row, add_output, prepare_output, publish
 
 __all__ = ["SIZES", "Size", "add_arguments", "bench_full_size", "run"]
@@ -115,7 +115,8 @@ def _training_rows(size: Size, device: torch.device, steps: int) -> list[Row]:
     from ..training.lora_base import LoraBase
     from ..training.lora_memory import step_memory
 
-    settings = LoraSettings(steps=1, precision="fp16" if device.type == "cuda" else "no", gradient_checkpointing=True)
+    precision = "fp16" if device.type == "cuda" else "no"
+    settings = replace(LORA_SETTINGS["sdxl"], steps=1, precision=precision)
     pairs = _noise_pairs(size.canvas, settings.batch)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
