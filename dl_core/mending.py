@@ -25,7 +25,7 @@ from .painter import Observer, Painter
 from .shapes import Image, Latlong
 from .white_balance import balance, cast_gains, check_white_balance
 
-__all__ = ["SHOWN_STOPS", "Mending", "estimate_mended", "level", "mending_metadata", "mending_remarks"]
+__all__ = ["SHOWN_STOPS", "Mending", "estimate_mended", "level", "mend_map", "mending_metadata", "mending_remarks"]
 
 
 SHOWN_STOPS: Final = 0.05
@@ -117,6 +117,21 @@ def estimate_mended(
     probe = estimate(seen, painter, settings, depth=depth, depth_of=depth_of, observer=observer)
     if bool((gains != 1).any()):
         probe = _with_cast(probe, photo_ldr, gains)
+    return mend_map(probe, photo_ldr, mending)
+
+
+def mend_map(probe: Probe, photo_ldr: Image, mending: Mending) -> Probe:
+    """What can be mended of an estimate that is there: its front filled and its map levelled.
+
+    Args:
+        probe: as `estimate.estimate` gives it, and not mended yet.
+        photo_ldr: (1, Y, X, 3) the photograph it is of.
+        mending: its white balance, which goes before the painting, has no say here.
+
+    Raises:
+        OptionError: as `Mending.check`.
+    """
+    mending.check()
     latlong, confidence = probe.latlong_hdr, probe.confidence
     if mending.front_fill and mending.fov is not None:
         filled = front_fill(latlong, photo_ldr, mending.fov, feather=mending.feather)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dl_core import cli
-from dl_core.bench.cameras import CAMERAS, Camera, random_camera, take
+from dl_core.bench.cameras import CAMERAS, Camera, cameras_of, random_camera, take
 from dl_core.bench.paintings import VARIANTS, Painting, Variant, paint_maps, planned
 from dl_core.bench.perfect import PerfectPainter
 from dl_core.errors import OptionError
@@ -59,7 +59,29 @@ def test_the_99th_percentile_of_a_photograph_is_nine_tenths() -> None:
 
 
 def test_the_array_protocol_looks_around_in_ten_steps() -> None:
-    assert sorted(camera.yaw % 360 for camera in CAMERAS["array"]("x", 0)) == [36.0 * i for i in range(10)]
+    assert sorted(camera.yaw % 360 for camera in cameras_of("array", "x", 0)) == [36.0 * i for i in range(10)]
+
+
+@pytest.mark.parametrize("protocol", ["three-spheres", "ldr"])
+@given(st.integers(1, 12))
+def test_level_photographs_look_around_evenly_from_the_papers_own(protocol: str, count: int) -> None:
+    yaws = [camera.yaw for camera in cameras_of(protocol, "x", 0, count)]
+    assert yaws[0] == 0
+    assert yaws == pytest.approx([360 * i / count for i in range(count)])
+
+
+@given(st.text(min_size=1, max_size=8), st.integers(2, 6))
+def test_more_random_photographs_begin_with_the_same_ones(key: str, count: int) -> None:
+    cameras = list(cameras_of("random-camera", key, 0, count))
+    assert cameras[0] == random_camera(key)
+    assert cameras[:-1] == list(cameras_of("random-camera", key, 0, count - 1))
+    assert len(set(cameras)) == count
+
+
+@pytest.mark.parametrize(("protocol", "count"), [("three-spheres", 0), ("random-camera", -1), ("array", 2)])
+def test_numbers_of_photographs_that_cannot_be_are_refused(protocol: str, count: int) -> None:
+    with pytest.raises(OptionError, match=f"--photographs.*{count}"):
+        cameras_of(protocol, "x", 0, count)
 
 
 @pytest.fixture
@@ -75,7 +97,7 @@ def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: 
     out = tmp_path / "out"
     said: list[str] = []
     paintings = list(planned([panorama], "three-spheres", list(VARIANTS), 0))
-    paint_maps(paintings, perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
+    paint_maps(paintings, lambda: perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
     assert len(said) == len(VARIANTS)
     truth = read_envmap(out / "truth" / f"{paintings[0].shot}.exr")
     light = {name: read_envmap(out / "maps" / name / f"{paintings[0].shot}.exr") for name in VARIANTS}
@@ -95,18 +117,31 @@ def test_what_is_there_is_not_painted_again(panorama: Path, tmp_path: Path) -> N
     out = tmp_path / "out"
     said: list[str] = []
     paintings = list(planned([panorama], "three-spheres", ["base", "both"], 0))
-    paint_maps(paintings, perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
+    paint_maps(paintings, lambda: perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
     (out / "maps" / "base" / f"{paintings[0].shot}.exr").unlink()
-    paint_maps(paintings, perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
+    paint_maps(paintings, lambda: perfect, PRESET, SETTINGS, out, painter="perfect", report=said.append)
     assert len(said) == 3
     assert "base:" in said[-1]
+
+
+def test_what_variants_share_is_painted_once(panorama: Path, tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def painter_of(variant: Variant, shot: object) -> Painter:
+        asked.append(variant.label)
+        return perfect(variant, shot)
+
+    paintings = list(planned([panorama], "three-spheres", ["both", "filled"], 0, photographs=2))
+    paint_maps(paintings, lambda: painter_of, PRESET, SETTINGS, tmp_path, painter="perfect", report=lambda line: None)
+    assert asked == [VARIANTS["both"].label] * 2
+    assert all(painting.map_in(tmp_path).is_file() for painting in paintings)
 
 
 @pytest.mark.parametrize(("painter", "seed"), [("perfect", 1), ("mini", SETTINGS.seed)])
 def test_a_folder_of_another_run_is_refused(painter: str, seed: int, tmp_path: Path) -> None:
     def begin(painter: str, seed: int) -> None:
         settings = replace(SETTINGS, seed=seed)
-        paint_maps([], perfect, PRESET, settings, tmp_path / "out", painter=painter, report=lambda line: None)
+        paint_maps([], lambda: perfect, PRESET, settings, tmp_path / "out", painter=painter, report=lambda line: None)
 
     begin("perfect", SETTINGS.seed)
     with pytest.raises(OptionError, match="--out"):
@@ -170,11 +205,24 @@ def test_a_last_ball_is_painted_where_the_preset_has_none(tmp_path: Path, capsys
     assert ending["evaluations"] - without["evaluations"] == 3 * 2 * round(rounds.strength * rounds.steps)
 
 
+def test_two_processes_paint_the_same_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    for name in ("a", "b"):
+        write_exr(scenes / f"{name}.exr", smooth()[0], metadata={})
+    words = ("ldr", "--panoramas", scenes, "--painter", "perfect", "--variants", "lora", "--photographs", 2)
+    one, two = (
+        protocol(capsys, *words, "--out", tmp_path / str(workers), "--workers", workers)["rows"] for workers in (1, 2)
+    )
+    assert one == two
+    assert len({row["shot"] for row in one}) == 4
+
+
 def test_the_array_stands_beside_the_papers_table_and_a_bracket_beats_one_exposure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cameras = CAMERAS["array"]
-    monkeypatch.setitem(CAMERAS, "array", lambda key, seed: cameras(key, seed)[:1])
+    monkeypatch.setitem(CAMERAS, "array", lambda *asked: cameras(*asked)[:1])
     folder = lamp(tmp_path).parent
     words = ("array", "--panoramas", folder, "--painter", "perfect", "--variants", "base,both")
     report = protocol(capsys, *words, "--convention", "published-array", "--out", tmp_path / "out")

@@ -35,7 +35,7 @@ from ..metrics import angular_error, energy_kept, irradiance, light_direction_er
 from ..painter import Observer, Painter, PaintRequest, PaintResult
 from ..presets import preset
 from ..shapes import BallImage, Latlong
-from .cameras import CAMERAS, take
+from .cameras import cameras_of, take
 from .journal import Journal
 from .painters import PAINTERS, Studio, add_files, identity, open_studio
 from .paintings import VARIANTS
@@ -227,7 +227,7 @@ def bench_bracket(
 
 
 def _measured(path: Path, studio: Studio, settings: Settings, way: str) -> Row:
-    (camera,) = CAMERAS["three-spheres"](path.stem, settings.seed)
+    (camera,) = cameras_of("three-spheres", path.stem, settings.seed)
     shot = take(read_envmap(path), camera)
     painter = WAYS[way].around(studio.painter_of(VARIANTS[STEERED], shot))
     sized = replace(settings, bracket=WAYS[way].bracket, height=shot.truth_hdr.shape[1])

@@ -15,11 +15,12 @@ from typing import Final
 from jaxtyping import Float
 from torch import Tensor
 
+from ..errors import OptionError
 from ..exposure import auto_exposure, expose
 from ..geometry import camera_rotation, latlong_to_perspective, rotate_latlong
 from ..shapes import Latlong
 
-__all__ = ["CAMERAS", "Camera", "Shot", "random_camera", "take"]
+__all__ = ["CAMERAS", "Camera", "Shot", "cameras_of", "random_camera", "take"]
 
 ROWS: Final = 192
 COLUMNS: Final = 256
@@ -95,10 +96,36 @@ def random_camera(key: str, seed: int = 0) -> Camera:
     return Camera(yaw, pitch, fov)
 
 
-CAMERAS: Final[dict[str, Callable[[str, int], Sequence[Camera]]]] = {
-    "three-spheres": lambda key, seed: (Camera(),),
-    "array": lambda key, seed: [Camera(yaw=36.0 * i, fov=50.0, rows=COLUMNS) for i in range(10)],
-    "random-camera": lambda key, seed: (random_camera(key, seed),),
-    "ldr": lambda key, seed: (Camera(),),
+def _around(count: int) -> list[Camera]:
+    """Level cameras at equal azimuths, the first to the panorama's centre."""
+    return [Camera(yaw=360.0 * number / count) for number in range(count)]
+
+
+def _drawn(key: str, seed: int, count: int) -> list[Camera]:
+    return [random_camera(key if number == 0 else f"{key}/{number}", seed) for number in range(count)]
+
+
+CAMERAS: Final[dict[str, Callable[[str, int, int], Sequence[Camera]]]] = {
+    "three-spheres": lambda key, seed, count: _around(count),
+    "array": lambda key, seed, count: [Camera(yaw=36.0 * i, fov=50.0, rows=COLUMNS) for i in range(10)],
+    "random-camera": _drawn,
+    "ldr": lambda key, seed, count: _around(count),
 }
-"""Cameras by protocol: (key of the panorama, seed) -> cameras."""
+"""Cameras by protocol: (key of the panorama, seed, how many where the protocol leaves it open) -> cameras."""
+
+
+def cameras_of(protocol: str, key: str, seed: int, photographs: int = 1) -> Sequence[Camera]:
+    """Cameras of a protocol in one panorama.
+
+    Args:
+        protocol: of `CAMERAS`.
+        key: of the panorama.
+        seed: of cameras that are drawn.
+        photographs: how many; the paper takes one. Level cameras stand at equal azimuths, random ones are drawn anew.
+
+    Raises:
+        OptionError: none, or other than one where the protocol has a number of its own.
+    """
+    if photographs < 1 or (protocol == "array" and photographs > 1):
+        raise OptionError("--photographs", photographs, "1 or more; 1 for array, which looks around in ten steps")
+    return CAMERAS[protocol](key, seed, photographs)

@@ -2,10 +2,10 @@
 
 Photographs are taken inside each panorama from several cameras, their light is estimated, and the error that the
 estimate expects of itself is compared with the one it has: by rank correlations over photographs and over all
-directions of all of them, and over the directions of each map by what share of the worst tenth lies in the fifth that
-is trusted least. Errors are compared in radiance, the photograph's white being 1, for that is what lights a render;
-in stops, in which a dark corner counts as much as a lamp; and as the share of the scene's light that is misplaced,
-which a scene's brightness does not enter.
+directions of all of them, and by what share of the worst tenth of directions lies in the fifth that is trusted least,
+for each map and over all of them. Errors are compared in radiance, the photograph's white being 1, for that is what
+lights a render; in stops, in which a dark corner counts as much as a lamp; and as the share of the scene's light that
+is misplaced, which a scene's brightness does not enter.
 
 With `--calibrate FILE` the weights of the evidence are fitted to the errors and written to the file. Figures of a run
 that calibrates are on its own maps; run it again on others, with `--calibration FILE`.
@@ -218,17 +218,22 @@ def _judged(row: Row, calibration: Calibration) -> Row:
     }
 
 
-def _over_directions(measured: Sequence[Row], calibration: Calibration) -> float | None:
-    """Rank correlation of expected and actual errors of luminance over all directions of all photographs."""
+def _over_directions(measured: Sequence[Row], calibration: Calibration) -> Row:
+    """How expected and actual errors of luminance go together over all directions of all photographs."""
     doubts = np.concatenate([_expected(row, calibration)[1] for row in measured])
-    return _number(rank_correlation(doubts.tolist(), [value for row in measured for value in row[DIFFERENCE_KEY]]))
+    missed = np.concatenate([np.asarray(row[DIFFERENCE_KEY]) for row in measured])
+    shares = np.tile(direction_shares(), len(measured)) / len(measured)
+    return {
+        "rank_correlation_directions": _number(rank_correlation(doubts.tolist(), missed.tolist())),
+        f"{_HELD[0]}_directions": held_by_least_trusted(doubts, missed, shares),
+    }
 
 
 def _number(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _summary(rows: Sequence[Row], over_directions: float | None) -> list[Row]:
+def _summary(rows: Sequence[Row], over_directions: Row) -> list[Row]:
     def over(key: str) -> list[float]:
         return [row[key] for row in rows if row[key] is not None]
 
@@ -243,7 +248,7 @@ def _summary(rows: Sequence[Row], over_directions: float | None) -> list[Row]:
         {
             "photographs": len(rows),
             **correlations,
-            "rank_correlation_directions": over_directions,
+            **over_directions,
             **{f"{key}_mean" if key not in _HELD else key: fmean(over(key)) if over(key) else None for key in means},
         }
     ]
@@ -275,5 +280,6 @@ _SUMMARY: Final = (
     Column("expected", "expected_error_stops_mean", ".2f"),
     Column("rank correlation", "rank_correlation_stops", ".2f"),
     Column("worst tenth held by the least trusted fifth", _HELD[0], ".0%"),
+    Column("over directions", f"{_HELD[0]}_directions", ".0%"),
     Column("in stops", _HELD[1], ".0%"),
 )

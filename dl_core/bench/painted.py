@@ -8,8 +8,9 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -19,12 +20,13 @@ from ..estimate import Settings
 from ..imageio import read_envmap, read_exr_header
 from ..presets import Preset, preset
 from .baselines import BASELINES, answer_maps, open_baselines
-from .cameras import CAMERAS
-from .painters import PAINTERS, add_files, identity, open_studio
-from .paintings import VARIANTS, Painting, paint_maps, planned
+from .cameras import cameras_of
+from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
+from .paintings import VARIANTS, PainterOf, Painting, paint_maps, planned
 from .published import PUBLISHED
 from .report import Column, Report, Row, panorama_files, prepare_output, publish, say, table
 from .scoring import PROTOCOLS, score_maps, summarize_errors, summary_columns
+from .workers import check_workers
 
 __all__ = ["add_arguments", "run"]
 
@@ -44,7 +46,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="paint a last ball from the median, as the paper does, also where the preset ends in the median",
     )
+    add(
+        "--photographs",
+        type=int,
+        default=1,
+        help="of each panorama: at equal azimuths, random cameras drawn anew (default: 1, as in the paper; not array)",
+    )
     add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
+    add("--workers", type=int, default=1, help="processes, each with a panorama at a time (default: 1)")
     add_files(group)
 
 
@@ -52,15 +61,17 @@ def run(args: argparse.Namespace) -> int:
     """Paint what the folder of `--out` does not hold yet, then score every map in it.
 
     Raises:
-        OptionError: no `--out`, an unknown painter, variant or preset, or a folder of another run.
+        OptionError: no `--out`, an unknown painter, variant or preset, no photographs or too many processes, or a
+            folder of another run.
     """
     if args.out is None:
         raise OptionError("--out", None, "a folder for the painted maps")
+    check_workers(args.workers)
     variants = _names(args.variants, VARIANTS, "--variants")
     panoramas = panorama_files(args.panoramas)
-    paintings = list(planned(panoramas, args.protocol, variants, args.seed))
+    paintings = list(planned(panoramas, args.protocol, variants, args.seed, args.photographs))
     compared = _names(args.baselines, BASELINES, "--baselines") if args.baselines else []
-    answers = list(planned(panoramas, args.protocol, compared, args.seed))
+    answers = list(planned(panoramas, args.protocol, compared, args.seed, args.photographs))
     chosen = preset(args.preset)
     if args.last_ball:
         chosen = replace(chosen, rounds=replace(chosen.rounds, final=True))
@@ -71,7 +82,14 @@ def run(args: argparse.Namespace) -> int:
     settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
     baselines = open_baselines(compared, args.regressor, replace(settings, evs=chosen.evs))
     paint_maps(
-        paintings, studio.painter_of, chosen, settings, args.out, painter=identity(args.painter, files), report=say
+        paintings,
+        partial(_painters, studio_for_workers(args.workers, studio, args.painter, files)),
+        chosen,
+        settings,
+        args.out,
+        painter=identity(args.painter, files),
+        workers=args.workers,
+        report=say,
     )
     answer_maps(answers, baselines, args.out, report=say)
     rows = [row for painting in (*paintings, *answers) for row in _score(painting, args)]
@@ -90,6 +108,10 @@ def run(args: argparse.Namespace) -> int:
             "\nprinted in the paper, on its own data\n" + table(_published(args.protocol), _PUBLISHED) + "\n"
         )
     return 0
+
+
+def _painters(studio_of: Callable[[], Studio]) -> PainterOf:
+    return studio_of().painter_of
 
 
 def _names(text: str, table: Collection[str], option: str) -> list[str]:
@@ -122,9 +144,9 @@ def _description(args: argparse.Namespace, settings: Settings, chosen: Preset) -
         "evs": list(chosen.evs),
         "canvas_px": settings.canvas,
         "ball_px": settings.diameter,
-        "cameras": [camera.name for camera in CAMERAS[args.protocol]("", args.seed)]
+        "cameras": [camera.name for camera in cameras_of(args.protocol, "", args.seed, args.photographs)]
         if args.protocol != "random-camera"
-        else "drawn for each panorama: fov 30 to 150, elevation -45 to 45, any azimuth",
+        else f"{args.photographs} drawn for each panorama: fov 30 to 150, elevation -45 to 45, any azimuth",
         "scored": PROTOCOLS[args.protocol].summary,
         **PROTOCOLS[args.protocol].conditions,
         "published": _published(args.protocol),

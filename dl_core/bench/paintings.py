@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,14 +20,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import OptionError
-from ..estimate import Probe, Settings
+from ..estimate import Probe, Settings, estimate
 from ..exposure import expose
 from ..geometry import latlong_to_ball
 from ..imageio import atomic, read_envmap, write_exr, write_png
-from ..mending import Mending, estimate_mended
-from ..painter import Observer, Painter
+from ..mending import Mending, mend_map
+from ..painter import Painter
 from ..presets import Preset
-from .cameras import CAMERAS, Camera, Shot, take
+from .cameras import Camera, Shot, cameras_of, take
+from .workers import results_of
 
 __all__ = ["VARIANTS", "PainterOf", "Painting", "Variant", "paint_maps", "planned"]
 
@@ -98,34 +100,40 @@ class Painting:
         return folder / "sheets" / self.variant / f"{self.shot}.png"
 
 
-def planned(panoramas: Sequence[Path], protocol: str, variants: Sequence[str], seed: int) -> Iterator[Painting]:
-    """Every map of a run, panorama by panorama, so that a run cut short has whole panoramas."""
+def planned(
+    panoramas: Sequence[Path], protocol: str, variants: Sequence[str], seed: int, photographs: int = 1
+) -> Iterator[Painting]:
+    """Every map of a run, panorama by panorama, so that a run cut short has whole panoramas.
+
+    Raises:
+        OptionError: as `cameras_of`.
+    """
     for panorama in panoramas:
-        for camera in CAMERAS[protocol](panorama.stem, seed):
+        for camera in cameras_of(protocol, panorama.stem, seed, photographs):
             yield from (Painting(panorama, camera, variant) for variant in variants)
 
 
 def paint_maps(
     paintings: Sequence[Painting],
-    painter_of: PainterOf,
+    painters: Callable[[], PainterOf],
     preset: Preset,
     settings: Settings,
     folder: Path,
     *,
     painter: str,
-    observer: Observer | None = None,
+    workers: int = 1,
     report: Callable[[str], None],
 ) -> None:
     """Paint what a folder does not hold yet.
 
     Args:
         paintings: what to paint.
-        painter_of: gives the painter.
-        painter: what tells it from other painters; a folder holds maps of one.
+        painters: opens what gives the painters; with several workers it has to be one that can be pickled.
         preset: schedule and bracket of the full method.
         settings: all else: canvas, ball, merge, seed, rows of the map.
         folder: of the run.
-        observer: hears of progress; may stop the run by raising `Interrupted`.
+        painter: what tells it from other painters; a folder holds maps of one.
+        workers: processes, each with a panorama at a time.
         report: told of each map, once it is written.
 
     Raises:
@@ -133,20 +141,39 @@ def paint_maps(
         OutputError: the folder cannot be written.
     """
     _require_same_run(folder, {"painter": painter, "preset": asdict(preset), "settings": asdict(settings)})
-    for number, painting in enumerate(paintings, 1):
-        if painting.map_in(folder).is_file():
-            continue
-        shot = take(read_envmap(painting.panorama), painting.camera)
-        variant = VARIANTS[painting.variant]
-        probe = estimate_mended(
-            shot.photo_ldr,
-            painter_of(variant, shot),
-            variant.settings(preset, settings),
-            Mending(variant.front_fill, painting.camera.longer_fov),
-            observer=observer,
-        )
-        _keep(folder, painting, shot, probe)
-        report(f"{number}/{len(paintings)} {painting.shot} {variant.label}: {probe.evaluations} evaluations")
+    wanted = [painting for painting in paintings if not painting.map_in(folder).is_file()]
+    inside = [
+        [painting for painting in wanted if painting.panorama == panorama]
+        for panorama in dict.fromkeys(painting.panorama for painting in wanted)
+    ]
+    task = partial(_paint_inside, painters=painters, preset=preset, settings=settings, folder=folder)
+    for number, line in enumerate(results_of(task, inside, workers), 1):
+        report(f"{number}/{len(wanted)} {line}")
+
+
+def _paint_inside(
+    paintings: Sequence[Painting],
+    painters: Callable[[], PainterOf],
+    preset: Preset,
+    settings: Settings,
+    folder: Path,
+) -> Iterator[str]:
+    """Paint maps of one panorama; a line on each, once it is written.
+
+    What variants of a photograph share is painted once.
+    """
+    painter_of, light = painters(), read_envmap(paintings[0].panorama)
+    for camera in dict.fromkeys(painting.camera for painting in paintings):
+        shot = take(light, camera)
+        painted: dict[tuple[Settings, bool], Probe] = {}
+        for painting in (painting for painting in paintings if painting.camera == camera):
+            variant = VARIANTS[painting.variant]
+            key = (variant.settings(preset, settings), variant.lora)
+            if key not in painted:
+                painted[key] = estimate(shot.photo_ldr, painter_of(variant, shot), key[0])
+            probe = mend_map(painted[key], shot.photo_ldr, Mending(variant.front_fill, camera.longer_fov))
+            _keep(folder, painting, shot, probe)
+            yield f"{painting.shot} {variant.label}: {probe.evaluations} evaluations"
 
 
 def _require_same_run(folder: Path, options: dict[str, Any]) -> None:
