@@ -71,6 +71,8 @@ RENDER_LIMIT: Final = 2 * ROWS_LIMIT**2
 """Pixels a rendered picture may declare: those of the largest environment map."""
 DECODED_LIMIT: Final = 1 << 32
 """Bytes that all channels of an EXR file may take once decoded: 4 GiB."""
+UNDERSHOOT: Final = 0.01
+"""Share of a map's light that values below 0 may take away and still be taken for ringing."""
 CONFIDENCE_CHANNEL: Final = "confidence.Y"
 """Of the layer that says how far each direction can be trusted (`confidence.Confidence.map`)."""
 _HEADER_BYTES: Final = 1 << 16
@@ -144,6 +146,23 @@ def _require_radiance(source: object, pixels: NDArray[Any]) -> None:
         if count:
             row, column = (int(index) for index in np.argwhere(found)[0][:2])
             raise ImageError(source, f"holds {count} {fault} values, the first at row {row}, column {column}")
+
+
+def _without_undershoot(path: object, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A map with its few slightly negative values raised to 0; one with more of them is no radiance, and stays as it is.
+
+    Filters with negative lobes and lossy compression (DWA) leave such values around lights.
+    """
+    below = pixels < 0
+    missing = -float(pixels[below].sum(dtype=np.float64))
+    if not 0 < missing <= UNDERSHOOT * float(pixels[pixels > 0].sum(dtype=np.float64)):
+        return pixels
+    warnings.warn(
+        f"{path}: {int(below.sum())} values down to {float(pixels[below].min()):.3g} are below 0, as ringing leaves "
+        "them, and were raised to 0",
+        stacklevel=3,
+    )
+    return np.maximum(pixels, np.float32(0))
 
 
 def _latlong_array(latlong_hdr: Tensor) -> NDArray[np.float32]:
@@ -398,7 +417,9 @@ def read_envmap(path: str | Path) -> Latlong:
         (1, H, 2H, 3) float32 linear radiance.
 
     Raises:
-        ImageError: missing, truncated, not a 2:1 map, more than 8,192 rows, no RGB, NaN, infinite or negative pixels.
+        ImageError: missing, truncated, not a 2:1 map, more than 8,192 rows, no RGB, NaN or infinite pixels, or negative
+            ones that take away more than `UNDERSHOOT` of the light; where they take less they are raised to 0, with a
+            warning.
     """
     path = Path(path)
     if is_exr(path):
@@ -408,6 +429,7 @@ def read_envmap(path: str | Path) -> Latlong:
         pixels = _read_radiance(path, _require_map_size)
     else:
         raise ImageError(path, "is neither an EXR nor a Radiance (.hdr) file")
+    pixels = _without_undershoot(path, pixels)
     _require_radiance(path, pixels)
     return torch.from_numpy(pixels)[None]
 

@@ -53,7 +53,7 @@ class Rounds:
             to the end. Without one the answer is a median of clean images predicted that early, softer still.
         tolerance: error that a median may have, as `settling.error_bound` bounds it, in display values; a round ends
             once its median is within. Without one every round paints N balls.
-        minimum: fewest balls of a round with a tolerance, N being the most in any case.
+        min_balls: fewest balls of a round with a tolerance, N being the most in any case.
         reject: whether balls unlike the others are left out of medians without a tolerance, too, and replaced, up to
             half as many as N.
     """
@@ -65,7 +65,7 @@ class Rounds:
     final: bool = True
     until: float = 1.0
     tolerance: float | None = None
-    minimum: int = 6
+    min_balls: int = 6
     reject: bool = False
 
     def __post_init__(self) -> None:
@@ -81,13 +81,13 @@ class Rounds:
             check_schedule(self.steps, self.strength if self.rounds > 1 else 1.0, self.until)
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise OptionError("tolerance", self.tolerance, "above 0, below 1, in display values; or none")
-        if not 3 <= self.minimum <= 1000:
-            raise OptionError("minimum", self.minimum, "3 to 1000 balls")
+        if not 3 <= self.min_balls <= 1000:
+            raise OptionError("min_balls", self.min_balls, "3 to 1000 balls")
 
     @property
     def counts(self) -> tuple[int, ...]:
         """Numbers of balls after which a round's median is looked at; N alone without a tolerance."""
-        return (self.balls,) if self.tolerance is None else looks(self.minimum, self.balls)
+        return (self.balls,) if self.tolerance is None else looks(self.min_balls, self.balls)
 
     @property
     def most(self) -> int:

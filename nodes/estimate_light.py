@@ -169,7 +169,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         depth_model: DepthModel | None = None,
         depth_disc: str = BY_PRESET,
         tolerance: float = 0.0,
-        min_balls: int = Rounds.minimum,
+        min_balls: int = Rounds.min_balls,
         until: float = 1.0,
         bracket: str = "fixed",
         budget: float = 0.0,
@@ -211,7 +211,7 @@ def _presets(evs: tuple[float, ...], tolerance: float, min_balls: int, reject: b
     """The presets as this node would run them."""
     return {
         name: replace(
-            row, evs=evs, rounds=replace(row.rounds, tolerance=tolerance or None, minimum=min_balls, reject=reject)
+            row, evs=evs, rounds=replace(row.rounds, tolerance=tolerance or None, min_balls=min_balls, reject=reject)
         )
         for name, row in PRESETS.items()
     }

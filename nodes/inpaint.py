@@ -196,7 +196,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         ev: float = 0.0,
         depth_model: DepthModel | None = None,
         tolerance: float = 0.0,
-        min_balls: int = Rounds.minimum,
+        min_balls: int = Rounds.min_balls,
         until: float = 1.0,
         reject: bool = False,
         **options: Any,

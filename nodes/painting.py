@@ -130,7 +130,7 @@ def settling_inputs() -> list[Any]:
         ),
         io.Int.Input(
             "min_balls",
-            default=Rounds.minimum,
+            default=Rounds.min_balls,
             min=3,
             max=1000,
             optional=True,
@@ -235,7 +235,7 @@ def rounds_of(
     final: bool,
     steps: int,
     tolerance: float = 0.0,
-    min_balls: int = Rounds.minimum,
+    min_balls: int = Rounds.min_balls,
     until: float = 1.0,
     reject: bool = False,
 ) -> Rounds:
@@ -245,7 +245,7 @@ def rounds_of(
         OptionError: an option out of range.
     """
     schedule = Rounds(balls, rounds, strength, steps, final, until) if name == CUSTOM else preset(name).rounds
-    return replace(schedule, tolerance=tolerance or None, minimum=min_balls, reject=reject)
+    return replace(schedule, tolerance=tolerance or None, min_balls=min_balls, reject=reject)
 
 
 def guidance_of(options: dict[str, Any]) -> Guidance:

@@ -47,7 +47,7 @@ class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
         steps: int,
         evs: str,
         tolerance: float = 0.0,
-        min_balls: int = Rounds.minimum,
+        min_balls: int = Rounds.min_balls,
         until: float = 1.0,
     ) -> io.NodeOutput:
         """Draw the chart."""

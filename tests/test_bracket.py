@@ -164,7 +164,7 @@ def test_no_exposure_too_many_and_none_too_few(elevation: float, azimuth: float,
 
 def test_a_tolerance_is_kept_where_exposures_clip() -> None:
     """The dark exposures of a scene without lights are settled at once, however their balls differ elsewhere."""
-    settings = replace(FIXED, rounds=Rounds(12, 1, 0.8, 2, final=False, tolerance=0.005, minimum=4))
+    settings = replace(FIXED, rounds=Rounds(12, 1, 0.8, 2, final=False, tolerance=0.005, min_balls=4))
     painter = AnalyticPainter(overcast(), Flaws(uneven=0.02))
     probe = estimate(GREY, painter, settings)
     assert [exposure.tallies[0].painted for exposure in probe.exposures] == [12, 4, 4]

@@ -336,7 +336,7 @@ def test_json_report(backend: Callable[..., None], photo: Path, out: Path, capsy
         (["--darkest", "-10"], "darkest is -10.0; accepted: nothing with a fixed bracket"),
         (["--bracket", "scene", "--darkest", "0"], "darkest is 0.0; accepted: -40 up to"),
         (["--tolerance", "0"], "tolerance is 0.0"),
-        (["--tolerance", "0.1", "--min-balls", "2"], "minimum is 2"),
+        (["--tolerance", "0.1", "--min-balls", "2"], "min_balls is 2"),
         (["--merge", "mean"], "merge is 'mean'; accepted: robust, channel, paper"),
         (["--backend", "flux"], "backend is 'flux'; accepted: mini, diffusers"),
         (["--precision", "int8"], "--precision is 'int8'; accepted: float32, bfloat16, float16"),

@@ -196,7 +196,7 @@ class Sparing:
         self.heard.append(len(balls))
 
 
-SETTLING = Rounds(balls=12, rounds=2, strength=0.5, steps=4, tolerance=0.05, minimum=4)
+SETTLING = Rounds(balls=12, rounds=2, strength=0.5, steps=4, tolerance=0.05, min_balls=4)
 
 
 def test_a_tolerance_asks_for_balls_a_few_at_a_time() -> None:
@@ -321,8 +321,8 @@ def test_a_second_round_mends_what_the_first_left() -> None:
         ({"tolerance": 0.0}, "tolerance"),
         ({"tolerance": 1.0}, "tolerance"),
         ({"tolerance": math.nan}, "tolerance"),
-        ({"minimum": 2}, "minimum"),
-        ({"minimum": 1001}, "minimum"),
+        ({"min_balls": 2}, "min_balls"),
+        ({"min_balls": 1001}, "min_balls"),
     ],
 )
 def test_wrong_rounds_are_named(options: dict[str, float], name: str) -> None:

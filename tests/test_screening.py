@@ -125,7 +125,7 @@ def write_raw(path: Path, pixels: torch.Tensor) -> None:
         (lambda path: write_exr(path, (bright(64)[0] * 9).clamp(max=255).round(), metadata={}), "8-bit codes"),
         (lambda path: write_exr(path, bright(32)[0], metadata={}), "has 32 rows; 64 or more"),
         (lambda path: write_raw(path, with_value(float("nan"))), "holds 1 NaN values, the first at row 3, column 5"),
-        (lambda path: write_raw(path, with_value(-0.5)), "holds 1 negative values"),
+        (lambda path: write_raw(path, with_value(-1e6)), "holds 1 negative values"),
         (lambda path: write_raw(path, bright(64)[0, :, :100]), "is 100 x 64 pixels; a latlong map is twice as wide"),
         (lambda path: path.write_bytes(b"nothing of the kind"), "is neither an EXR nor a Radiance"),
         (lambda path: path.write_bytes(struct.pack("<II", 20000630, 2) + b"comp"), "is truncated"),

@@ -189,7 +189,7 @@ def painted(trial: int, flaws: Flaws, rounds: Rounds) -> tuple[list[int], Iterat
     return [seed for call in painter.requests for seed in call.seeds], result
 
 
-SEQUENTIAL = Rounds(balls=40, rounds=1, steps=1, final=False, tolerance=0.02, minimum=6)
+SEQUENTIAL = Rounds(balls=40, rounds=1, steps=1, final=False, tolerance=0.02, min_balls=6)
 
 
 def test_it_stops_at_the_wanted_error() -> None:
@@ -213,7 +213,7 @@ def test_it_stops_at_the_wanted_error() -> None:
 def test_it_never_passes_its_maximum_and_stops_only_when_settled(
     uneven: float, disco: float, tolerance: float, most: int, trial: int
 ) -> None:
-    rounds = Rounds(balls=most, rounds=1, steps=1, final=False, tolerance=tolerance, minimum=4)
+    rounds = Rounds(balls=most, rounds=1, steps=1, final=False, tolerance=tolerance, min_balls=4)
     asked, result = painted(trial, Flaws(uneven=uneven, disco=disco), rounds)
     (tally,) = result.tallies
     assert min(4, most) <= tally.painted <= most

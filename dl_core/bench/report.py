@@ -222,7 +222,9 @@ def publish(
 
 def _tables(report: Report, rows: Sequence[Column], summary: Sequence[Column]) -> str:
     parts = [table(report.rows, rows)] if rows else []
-    parts += ["summary, median / worst\n" + table(report.summary, summary)] if summary else []
+    if summary:
+        pairs = any(f"{column.key}_median" in record for record in report.summary for column in summary)
+        parts.append(("summary, median / worst\n" if pairs else "summary\n") + table(report.summary, summary))
     spent = f"{report.evaluations} denoiser evaluations" if report.evaluations else "no denoiser evaluations"
     parts.append(f"{report.bench}: {len(report.rows)} rows, {report.seconds:.1f} s, {spent}")
     return "\n\n".join(parts) + "\n"

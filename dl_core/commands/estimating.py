@@ -168,7 +168,7 @@ def _mending(args: argparse.Namespace) -> tuple[Mending, list[str]]:
 def _preset(args: argparse.Namespace, name: str) -> Preset:
     """A preset with what the command line replaces of it."""
     chosen = preset(name)
-    rounds = replace(chosen.rounds, tolerance=args.tolerance, minimum=args.min_balls, reject=args.reject)
+    rounds = replace(chosen.rounds, tolerance=args.tolerance, min_balls=args.min_balls, reject=args.reject)
     return replace(chosen, rounds=rounds, evs=chosen.evs if args.evs is None else parse_evs(args.evs))
 
 

@@ -306,7 +306,7 @@ def narrow_clip(graph: Any) -> Any:
         ({"height": 1}, "OptionError", "^height is 1"),
         ({"bracket": "long"}, "OptionError", "^bracket is 'long'; accepted: fixed, scene"),
         ({"tolerance": 1.5}, "OptionError", "^tolerance is 1.5"),
-        ({"tolerance": 0.1, "min_balls": 1}, "OptionError", "^minimum is 1"),
+        ({"tolerance": 0.1, "min_balls": 1}, "OptionError", "^min_balls is 1"),
         ({"merge": "guess"}, "OptionError", "^merge is 'guess'; accepted: robust, channel, paper"),
         ({"preset": "quick"}, "OptionError", "^preset is 'quick'; accepted: draft"),
         ({"balls": 0}, "OptionError", "^balls is 0"),
