@@ -149,7 +149,7 @@ def _require_radiance(source: object, pixels: NDArray[Any]) -> None:
 
 
 def _without_undershoot(path: object, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A map with its few slightly negative values raised to 0; one with more of them is no radiance, and stays as it is.
+    """A map with its few slightly negative values raised to 0; one with more of them is no radiance and stays as it is.
 
     Filters with negative lobes and lossy compression (DWA) leave such values around lights.
     """
