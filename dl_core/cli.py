@@ -1,6 +1,7 @@
 """The command line: `lightprobe COMMAND ...`. Commands are rows of a table and are imported only when asked for.
 
-Exit codes: 0 fine; 1 a fault of input, model or output; 2 an option that is not accepted; 130 interrupted.
+Exit codes: 0 fine; 1 a fault of input, model or output; 2 an option that is not accepted; 130 interrupted, by Ctrl-C or
+by the request to end (SIGTERM) that containers and job schedulers send.
 """
 
 from __future__ import annotations
@@ -8,10 +9,13 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, Protocol, cast, runtime_checkable
+from typing import Any, Final, Protocol, cast, runtime_checkable
 
 from . import __version__
 from .errors import Interrupted, OptionError, ProbeError
@@ -71,13 +75,33 @@ COMMANDS: Final[dict[str, Command]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; the exit code."""
     try:
-        return _dispatch(list(sys.argv[1:] if argv is None else argv)) or FINE
+        with _ending_as_by_ctrl_c():
+            return _dispatch(list(sys.argv[1:] if argv is None else argv)) or FINE
     except OptionError as error:
         return _complain(error, USAGE)
     except (KeyboardInterrupt, Interrupted):
         return _complain("interrupted; no file is half-written", INTERRUPTED)
     except ProbeError as error:
         return _complain(error, FAULT)
+
+
+@contextmanager
+def _ending_as_by_ctrl_c() -> Iterator[None]:
+    """Take a request to end for Ctrl-C: it, too, leaves checkpoints and no half-written file or orphaned job."""
+    if threading.current_thread() is not threading.main_thread():  # signals do not arrive elsewhere
+        yield
+        return
+
+    def end(number: int, frame: Any) -> None:
+        if signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None):  # as shells have it for jobs in the background
+            raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _dispatch(arguments: list[str]) -> int | None:

@@ -1,11 +1,15 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -416,6 +420,28 @@ def test_interruption_leaves_nothing_half_written(
 
 
 # --- spheres and inspect ---
+
+
+@pytest.mark.parametrize("ctrl_c", [signal.default_int_handler, signal.SIG_IGN])
+def test_a_request_to_end_interrupts(
+    ctrl_c: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also in the background, where shells have commands ignore Ctrl-C."""
+
+    def work(arguments: list[str]) -> int:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+        return 0
+
+    monkeypatch.setattr(cli, "_dispatch", work)
+    by_default = signal.getsignal(signal.SIGTERM)
+    before = signal.signal(signal.SIGINT, ctrl_c)
+    try:
+        assert cli.main([]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert signal.getsignal(signal.SIGTERM) == by_default
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_spheres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

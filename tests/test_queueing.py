@@ -456,8 +456,9 @@ def test_what_is_no_comfyui_server_is_given_up_at_once(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as on Unix")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_cancels_our_jobs_and_keeps_what_was_collected(
-    server: FakeComfyUI, photo: Photo, queue: Queue, workflow: Path, tmp_path: Path
+    server: FakeComfyUI, photo: Photo, queue: Queue, workflow: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     photos = [photo("quick.jpg"), photo("slow.jpg", "slow 60"), photo("waits.jpg"), photo("never.jpg")]
     server.inputs["theirs.jpg"] = b"ok"
@@ -470,7 +471,7 @@ def test_an_interrupt_cancels_our_jobs_and_keeps_what_was_collected(
     theirs = copy.deepcopy(PROMPT)
     theirs["2"]["inputs"]["image"] = "theirs.jpg"
     server.prompt({"prompt": theirs, "prompt_id": "theirs"})
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     report = json.loads(process.communicate(timeout=60)[0])
     assert process.returncode == 130
     assert report["interrupted"]
