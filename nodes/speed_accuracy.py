@@ -52,7 +52,7 @@ class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
     ) -> io.NodeOutput:
         """Draw the chart."""
         # matplotlib takes a second to import, which no other node should wait for.
-        from ..dl_core.bench.shipped_chart import chart_of
+        from ..dl_core.bench.pareto.shipped_chart import chart_of
 
         schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
         return io.NodeOutput(*chart_of(schedule, check_evs(parse_evs(evs))))

@@ -9,9 +9,9 @@ import torch
 
 from dl_core.backends.mini import MiniModel
 from dl_core.ball import place_ball
-from dl_core.training.lora_base import LoraBase
-from dl_core.training.lora_settings import LORA_SETTINGS, LoraSettings
-from dl_core.training.pairs import Pair
+from dl_core.training.data.pairs import Pair
+from dl_core.training.lora.base import LoraBase
+from dl_core.training.lora.settings import LORA_SETTINGS, LoraSettings
 
 __all__ = ["CANVAS", "SETTINGS", "Untrained", "random_pairs"]
 

@@ -14,23 +14,23 @@ from torch import Tensor
 from dl_core.backends import mini
 from dl_core.backends.mini import MiniModel
 from dl_core.ball import disc_mask, place_ball
-from dl_core.bench.baselines import BASELINES, answer_maps, open_baselines
 from dl_core.bench.cameras import Shot
 from dl_core.bench.paintings import planned
 from dl_core.bench.perfect import PerfectPainter, RoundTripPainter
+from dl_core.bench.protocol.baselines import BASELINES, answer_maps, open_baselines
 from dl_core.errors import ModelError, OptionError
 from dl_core.estimate import Settings
 from dl_core.exposure import encode_display
 from dl_core.geometry import ball_coverage, rotate_latlong
 from dl_core.imageio import read_envmap, read_exr_header, write_exr
 from dl_core.painter import PaintRequest, SilentObserver
-from dl_core.training.export import write_networks
-from dl_core.training.feed import Feed
-from dl_core.training.loop import Budget
-from dl_core.training.mean_light import mean_light, write_mean_light
-from dl_core.training.regressor import train_regressor
-from dl_core.training.regressor_painter import RegressorPainter
-from dl_core.training.scenes import SceneSampler
+from dl_core.training.mini.export import write_networks
+from dl_core.training.mini.feed import Feed
+from dl_core.training.mini.loop import Budget
+from dl_core.training.mini.mean_light import mean_light, write_mean_light
+from dl_core.training.mini.regressor import train_regressor
+from dl_core.training.mini.regressor_painter import RegressorPainter
+from dl_core.training.mini.scene_sampler import SceneSampler
 
 SETTINGS = Settings(canvas=128, diameter=64, height=32, evs=(0.0, -2.5, -5.0))
 LEVEL = torch.tensor([0.1, 0.3, 0.5])

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from dl_core.backends.loading import ModelFiles
-from dl_core.bench.early_decoding import DecodingSection
-from dl_core.bench.early_latents import LatentsSection, latent_median
-from dl_core.bench.early_noise import NoiseSection, rank_correlation, ranks
-from dl_core.bench.early_section import Options, Scene, Section, ball_rmse
-from dl_core.bench.early_until import UntilSection
+from dl_core.bench.early.decoding import DecodingSection
+from dl_core.bench.early.latents import LatentsSection, latent_median
+from dl_core.bench.early.noise import NoiseSection, rank_correlation, ranks
+from dl_core.bench.early.section import Options, Scene, Section, ball_rmse
+from dl_core.bench.early.until import UntilSection
 from dl_core.bench.painters import PAINTERS, Studio, open_studio
 from dl_core.bench.perfect import PerfectPainter
 from dl_core.cli import main

@@ -9,8 +9,8 @@ import torch
 
 from dl_core.bench.full_size import SIZES, bench_full_size
 from dl_core.cli import main
-from dl_core.training.lora_memory import step_memory
-from dl_core.training.lora_settings import LoraSettings
+from dl_core.training.lora.memory import step_memory
+from dl_core.training.lora.settings import LoraSettings
 
 
 def test_training_and_painting_are_measured_beside_what_is_computed(capsys: pytest.CaptureFixture[str]) -> None:

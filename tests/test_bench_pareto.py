@@ -19,7 +19,7 @@ from dl_core.ball import place_ball
 from dl_core.bench.bootstrap import mean_interval
 from dl_core.bench.front import on_front
 from dl_core.bench.painters import PAINTERS, Studio
-from dl_core.bench.schedules import GRIDS, Schedule
+from dl_core.bench.pareto.schedules import GRIDS, Schedule
 from dl_core.bench.shared_balls import SharedBalls
 from dl_core.cli import main
 from dl_core.errors import OptionError

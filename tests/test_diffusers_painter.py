@@ -21,7 +21,7 @@ from dl_core.ball import Ball, crop_ball, paint_depth, place_ball
 from dl_core.errors import ImageError, Interrupted, ModelError, OptionError
 from dl_core.iterative import Rounds, rounds_evaluations
 from dl_core.painter import IMPUTINGS, Imputing, PaintRequest, SilentObserver, steps_run
-from dl_core.training.autoencoder import write_closed_form_encoder, write_thumbnail_decoder
+from dl_core.training.mini.autoencoder import write_closed_form_encoder, write_thumbnail_decoder
 
 SIDE = 128
 

@@ -29,14 +29,14 @@ from dl_core.backends.mini import SCHEDULER_CONFIG
 from dl_core.ball import place_ball
 from dl_core.errors import ImageError, ModelError, OptionError, OutputError
 from dl_core.exposure_prompts import embedding_at
-from dl_core.training import latent_cache
-from dl_core.training.denoiser import weighted_error
-from dl_core.training.exposure_lora import TrainedLora, train_exposure_loras
-from dl_core.training.latent_cache import LatentCache, data_fingerprint, encode_pairs
-from dl_core.training.lora_batches import LoraBatches
-from dl_core.training.lora_checkpoint import CHECKPOINT, read_checkpoint
-from dl_core.training.lora_settings import SEPARATE_PROMPT, LoraSettings, parse_evs, parse_timesteps
-from dl_core.training.lora_validation import Validation
+from dl_core.training.lora import latent_cache
+from dl_core.training.lora.batches import LoraBatches
+from dl_core.training.lora.checkpoint import CHECKPOINT, read_checkpoint
+from dl_core.training.lora.exposure_lora import TrainedLora, train_exposure_loras
+from dl_core.training.lora.latent_cache import LatentCache, data_fingerprint, encode_pairs
+from dl_core.training.lora.settings import SEPARATE_PROMPT, LoraSettings, parse_evs, parse_timesteps
+from dl_core.training.lora.validation import Validation
+from dl_core.training.mini.denoiser import weighted_error
 from dl_core.training.tensor_files import write_tensors
 
 ROOT = Path(__file__).parents[1]
@@ -310,7 +310,7 @@ import torch
 sys.path.insert(0, {tests!r})
 from foreground import hear_ctrl_c
 from lora_training import SETTINGS, Untrained, random_pairs
-from dl_core.training.exposure_lora import train_exposure_loras
+from dl_core.training.lora.exposure_lora import train_exposure_loras
 from dl_core.training.tensor_files import write_tensors
 
 work, steps, accumulation, minutes = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])

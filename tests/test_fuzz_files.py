@@ -38,9 +38,9 @@ from dl_core.imageio import (
 from dl_core.lora import read_lora
 from dl_core.queueing.ledger import RECORDS, Ledger
 from dl_core.queueing.workflow import read_workflow
-from dl_core.training.pairs import FORMAT, INDEX, PairShards
+from dl_core.training.data.pairs import FORMAT, INDEX, PairShards
+from dl_core.training.data.shards import Shard, is_whole, png_bytes, write_pairs
 from dl_core.training.panoramas import panorama_files
-from dl_core.training.shards import Shard, is_whole, png_bytes, write_pairs
 
 WORKFLOWS = Path(__file__).resolve().parent.parent / "workflows"
 SHAPES = {"down.to_q": (8, 8), "mid.to_k": (8, 6)}

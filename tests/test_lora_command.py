@@ -23,13 +23,13 @@ from dl_core.backends.mini import UNET_CONFIG, load_mini, read_weights
 from dl_core.backends.sdxl_files import SDXL_FOLDER
 from dl_core.cli import main
 from dl_core.lora import read_lora
-from dl_core.training.exposure_lora import add_exposure_adapter
-from dl_core.training.lora_base import LoraBase
-from dl_core.training.lora_command import add_arguments
-from dl_core.training.lora_memory import step_memory
-from dl_core.training.lora_run import settings_of
-from dl_core.training.lora_settings import LORA_SETTINGS, LoraSettings
-from dl_core.training.pairs import FORMAT, INDEX, pair_key
+from dl_core.training.data.pairs import FORMAT, INDEX, pair_key
+from dl_core.training.lora.base import LoraBase
+from dl_core.training.lora.command import add_arguments
+from dl_core.training.lora.exposure_lora import add_exposure_adapter
+from dl_core.training.lora.memory import step_memory
+from dl_core.training.lora.run import settings_of
+from dl_core.training.lora.settings import LORA_SETTINGS, LoraSettings
 
 ROOT = Path(__file__).parents[1]
 

@@ -20,9 +20,9 @@ from dl_core.errors import ImageError, OptionError
 from dl_core.exposure import expose
 from dl_core.imageio import read_photograph
 from dl_core.iterative import Rounds
-from dl_core.training.lora_base import LoraBase
-from dl_core.training.median_pairs import MedianPainting, paint_medians
-from dl_core.training.pairs import PairShards
+from dl_core.training.data.pairs import PairShards
+from dl_core.training.lora.base import LoraBase
+from dl_core.training.turbo.median_pairs import MedianPainting, paint_medians
 
 CANVAS, DIAMETER = 64, 32
 PAINTING = MedianPainting(Rounds(balls=9, rounds=2, steps=4, final=False), (0.0, -2.5), 3, {"--model": "a"})

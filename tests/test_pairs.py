@@ -26,12 +26,12 @@ from dl_core.errors import ImageError, OptionError, OutputError
 from dl_core.exposure import decode_display, expose, quantize
 from dl_core.geometry import ball_coverage
 from dl_core.imageio import read_envmap, write_exr
-from dl_core.training.pair_data import DataOptions, hold_out, make_pairs
-from dl_core.training.pair_sampler import PairOptions, PairSampler
-from dl_core.training.pairs import PairShards
-from dl_core.training.procedural import draw_panorama
-from dl_core.training.shards import pair_members, planned_shards
-from dl_core.training.views import Camera
+from dl_core.training.data.pair_data import DataOptions, hold_out, make_pairs
+from dl_core.training.data.pair_sampler import PairOptions, PairSampler
+from dl_core.training.data.pairs import PairShards
+from dl_core.training.data.shards import pair_members, planned_shards
+from dl_core.training.data.views import Camera
+from dl_core.training.scenes.procedural import draw_panorama
 
 ROOT = Path(__file__).parents[1]
 SMALL = PairOptions(canvas=64, diameter=24, central=0.5, augment=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from dl_core.bench.shipped_chart import chart_of, shipped_rows
+from dl_core.bench.pareto.shipped_chart import chart_of, shipped_rows
 from dl_core.cli import main
 from dl_core.iterative import Rounds
 from dl_core.presets import PRESETS

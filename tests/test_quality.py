@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from dl_core.ball import crop_ball, paste_ball, place_ball
 from dl_core.bench.cameras import Camera, take
 from dl_core.bench.faulty_balls import FAULTS, examples
+from dl_core.bench.pareto.shipped_chart import CHART_FILE
 from dl_core.bench.quality import auc, fit_logistic
-from dl_core.bench.shipped_chart import CHART_FILE
 from dl_core.cli import main
 from dl_core.errors import ImageError, ModelError, OptionError
 from dl_core.exposure import expose

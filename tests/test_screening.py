@@ -17,10 +17,10 @@ from dl_core.bench.blender_maps import environment
 from dl_core.errors import OptionError
 from dl_core.geometry import camera_rotation, rotate_latlong
 from dl_core.imageio import write_exr, write_hdr
-from dl_core.training.duplicates import ALIKE, find_duplicates, likeness, signature
+from dl_core.training.data.duplicates import ALIKE, find_duplicates, likeness, signature
+from dl_core.training.data.screening import screen, unfit
 from dl_core.training.panoramas import find_panoramas, reduce_panorama
-from dl_core.training.procedural import draw_panorama
-from dl_core.training.screening import screen, unfit
+from dl_core.training.scenes.procedural import draw_panorama
 
 SHIPPED = ("apartment", "dancing_hall", "drachenfels_cellar", "kloppenheim_05", "narrow_moonlit_road")
 

@@ -24,18 +24,18 @@ from dl_core.errors import OptionError
 from dl_core.exposure import decode_display
 from dl_core.geometry import latlong_energy
 from dl_core.imageio import write_exr
-from dl_core.training.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
-from dl_core.training.control import train_control
-from dl_core.training.decoder import train_decoder
-from dl_core.training.denoiser import OFF_BALL_WEIGHT, draw_batch
-from dl_core.training.drawn_pairs import DrawnPairs
-from dl_core.training.export import write_networks
-from dl_core.training.feed import Ahead, Feed
-from dl_core.training.loop import Budget, train
+from dl_core.training.mini.autoencoder import block_latents, write_closed_form_encoder, write_thumbnail_decoder
+from dl_core.training.mini.control import train_control
+from dl_core.training.mini.decoder import train_decoder
+from dl_core.training.mini.denoiser import OFF_BALL_WEIGHT, draw_batch
+from dl_core.training.mini.drawn_pairs import DrawnPairs
+from dl_core.training.mini.export import write_networks
+from dl_core.training.mini.feed import Ahead, Feed
+from dl_core.training.mini.loop import Budget, train
+from dl_core.training.mini.scene_sampler import SceneSampler
+from dl_core.training.mini.stages import run_stage
 from dl_core.training.panoramas import draw_scenes, load_panoramas, panorama_files, reduce_panorama
-from dl_core.training.procedural import draw_panorama
-from dl_core.training.scenes import SceneSampler
-from dl_core.training.stages import run_stage
+from dl_core.training.scenes.procedural import draw_panorama
 from dl_core.training.starts import FIRST_START, SDEDIT_BELOW, SDEDIT_SHARE, carried_noise, draw_starts
 
 ROOT = Path(__file__).parents[1]
@@ -209,7 +209,7 @@ def test_where_a_sampler_starts_a_ball_is_noise_alone_and_the_photograph_is_not(
     panoramas: Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The same draws in two worlds: what differs between the batches comes from the pictures.
-    monkeypatch.setattr("dl_core.training.denoiser.draw_starts", lambda levels, generator: levels)
+    monkeypatch.setattr("dl_core.training.mini.denoiser.draw_starts", lambda levels, generator: levels)
     one, other = (
         draw_batch(SceneSampler(light, 64, 32, seed=1, centred=1.0), 0, Feed(24), full_canvas=128)
         for light in (panoramas, panoramas.flip(-1))
@@ -408,7 +408,7 @@ SHARED_STEPS = """
 import json, sys, torch
 from pathlib import Path
 from accelerate import PartialState
-from dl_core.training.loop import Budget, train
+from dl_core.training.mini.loop import Budget, train
 
 PartialState(cpu=True)
 torch.manual_seed(0)

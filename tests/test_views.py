@@ -23,7 +23,7 @@ from dl_core.geometry import (
     latlong_to_perspective,
 )
 from dl_core.projection import Perspective, disc_directions
-from dl_core.training.views import Camera, Surroundings, rows_shown, take_ball, take_photograph
+from dl_core.training.data.views import Camera, Surroundings, rows_shown, take_ball, take_photograph
 
 BLENDER = Path(__file__).parent / "data" / "blender"
 cameras = st.builds(

@@ -35,6 +35,7 @@ from ..exposure import luminance
 from ..imageio import atomic, read_envmap, require_writable
 from ..misplaced import OVERALL, ROWS, light_misplaced, overall_evidence
 from ..presets import preset
+from ..progress_lines import say
 from ..resize import resize_latlong
 from .cameras import random_camera, take
 from .confidence_fit import direction_shares, fit_shares, fit_weights, held_by_least_trusted, rank_correlation
@@ -42,7 +43,7 @@ from .journal import Journal
 from .map_distance import log_error
 from .painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
 from .paintings import VARIANTS
-from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, say
+from .report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 from .workers import check_workers, results_of
 
 __all__ = ["add_arguments", "run"]

@@ -1,7 +1,7 @@
 """`lightprobe bench full-size`: what SDXL's networks take on this machine, with random weights and no download.
 
 Memory and time do not depend on what weights say. Measured are a training of the exposure LoRA, as `lightprobe train
-lora` runs it, beside the bytes computed for it (`training.lora_memory`), and the painter's denoiser evaluations.
+lora` runs it, beside the bytes computed for it (`training.lora.memory`), and the painter's denoiser evaluations.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..ball import Ball, paint_depth, place_ball
 from ..errors import OptionError
 from ..painter import PaintRequest
 from ..shapes import Image
-from ..training.lora_settings import LORA_SETTINGS
+from ..training.lora.settings import LORA_SETTINGS
 from .report import Column, Report, Row, add_output, prepare_output, publish
 
 __all__ = ["SIZES", "Size", "add_arguments", "bench_full_size", "run"]
@@ -111,9 +111,9 @@ def _noise_pairs(canvas: int, count: int) -> list[_NoisePair]:
 
 def _training_rows(size: Size, device: torch.device, steps: int) -> list[Row]:
     from ..backends.diffusers_painter import PAPER_DEFAULTS
-    from ..training.exposure_lora import train_exposure_loras
-    from ..training.lora_base import LoraBase
-    from ..training.lora_memory import step_memory
+    from ..training.lora.base import LoraBase
+    from ..training.lora.exposure_lora import train_exposure_loras
+    from ..training.lora.memory import step_memory
 
     precision = "fp16" if device.type == "cuda" else "no"
     settings = replace(LORA_SETTINGS["sdxl"], steps=1, precision=precision)

@@ -37,7 +37,6 @@ __all__ = [
     "panorama_files",
     "prepare_output",
     "publish",
-    "say",
     "summarize_groups",
     "table",
 ]
@@ -136,11 +135,6 @@ def prepare_output(args: argparse.Namespace) -> None:
     except OSError as error:
         raise OutputError(args.out, f"cannot be made ({error.strerror})") from error
     require_writable(args.out / "report.json")
-
-
-def say(line: str) -> None:
-    """Tell of progress, where it does not mix with the report."""
-    sys.stderr.write(line + "\n")
 
 
 # --- results -----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from ..errors import ImageError, OptionError, OutputError
 from ..imageio import read_envmap, require_writable, write_exr
 from ..json_text import read_json
 from ..shapes import Latlong
-from .procedural import draw_panorama
+from .scenes.procedural import draw_panorama
 
 __all__ = ["KINDS", "draw_scenes", "find_panoramas", "load_panoramas", "panorama_files", "reduce_panorama"]
 
@@ -25,7 +25,7 @@ SUFFIXES: Final = (".exr", ".hdr")
 
 def _render(seed: int, height: int) -> Latlong:
     # Mitsuba is asked for only where something is to be rendered.
-    from .rendered import render_panorama
+    from .scenes.rendered import render_panorama
 
     return render_panorama(seed, height)
 

@@ -55,15 +55,15 @@ def drawn_pairs(count: int) -> list[Any]:
 
 def train(pipeline: Any, work: Path, steps: int, log: list[str]) -> Any:
     settings = replace(
-        pack_module("dl_core.training.lora_settings").LoraSettings(gradient_checkpointing=True),
+        pack_module("dl_core.training.lora.settings").LoraSettings(gradient_checkpointing=True),
         steps=steps,
         batch=1,
         learning_rate=1e-2,  # so that a few steps make a difference
     )
-    base = pack_module("dl_core.training.lora_base").LoraBase(
+    base = pack_module("dl_core.training.lora.base").LoraBase(
         "toy", pipeline, pack_module("dl_core.backends.diffusers_painter").PAPER_DEFAULTS
     )
-    (trained,) = pack_module("dl_core.training.exposure_lora").train_exposure_loras(
+    (trained,) = pack_module("dl_core.training.lora.exposure_lora").train_exposure_loras(
         base, drawn_pairs(3), settings, work, report=log.append
     )
     return trained

@@ -30,9 +30,10 @@ from ...errors import OptionError
 from ...estimate import Settings
 from ...misplaced import ROWS
 from ...presets import preset
+from ...progress_lines import say
 from ..journal import Journal
 from ..painters import PAINTERS, Studio, add_files, identity, open_studio, studio_for_workers
-from ..report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish, say
+from ..report import Column, Report, Row, add_output, add_panoramas, panorama_files, prepare_output, publish
 from ..workers import check_workers, results_of
 from .measure import SECTIONS, Grid, Panorama
 from .page import write_page

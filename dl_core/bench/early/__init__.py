@@ -1,0 +1,1 @@
+"""`lightprobe bench early`: what is lost and saved where less is denoised, decoded or drawn."""

@@ -1,0 +1,1 @@
+"""`lightprobe bench pareto`: error against cost over schedules, and the chart that comes along."""

@@ -1,0 +1,1 @@
+"""`lightprobe train lora`: the exposure LoRA, of SDXL or of the mini model."""

@@ -1,0 +1,1 @@
+"""`lightprobe train mini`: the mini model and its rivals, stage by stage."""

@@ -1,0 +1,1 @@
+"""`lightprobe train scenes`: procedural panoramas, drawn in closed form or path traced."""
