@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dl_core.bench import scoring
-from dl_core.bench.protocol.command import command as protocol
+from dl_core.bench.protocol import command as protocol
 from dl_core.bench.protocol.command import given_maps
 from dl_core.errors import ImageError, OptionError, OutputError
 from dl_core.imageio import write_exr, write_hdr

@@ -14,7 +14,7 @@ import torch
 
 from dl_core.errors import OptionError
 from dl_core.geometry import latlong_directions
-from dl_core.training.mini.scene_sampler import rendered
+from dl_core.training.scenes import rendered
 
 pytest.importorskip("mitsuba", reason="NO MITSUBA: the extra train is not installed")
 pytest.importorskip("pyoidn", reason="NO DENOISER: the extra train is not installed")
