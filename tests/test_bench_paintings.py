@@ -205,6 +205,27 @@ def test_a_last_ball_is_painted_where_the_preset_has_none(tmp_path: Path, capsys
     assert ending["evaluations"] - without["evaluations"] == 3 * 2 * round(rounds.strength * rounds.steps)
 
 
+def test_the_papers_merge_leaves_clipped_lamps_neutral(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = (
+        "ldr",
+        "--panoramas",
+        lamp(tmp_path).parent,
+        "--painter",
+        "perfect",
+        "--variants",
+        "both",
+        "--photographs",
+        1,
+    )
+    light = {}
+    for merge in ("robust", "paper"):
+        out = tmp_path / merge
+        assert protocol(capsys, *words, "--merge", merge, "--out", out)["protocol"]["merge"] == merge
+        light[merge] = read_envmap(out / "maps" / "both" / "lamp.y0_p0_f60.exr").amax(dim=(0, 1, 2))
+    assert float(light["robust"][0] / light["robust"][2]) == pytest.approx(8 / 3, rel=0.1)
+    assert float(light["paper"][0] / light["paper"][2]) < 1.2
+
+
 def test_two_processes_paint_the_same_maps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenes = tmp_path / "scenes"
     scenes.mkdir()
@@ -244,6 +265,7 @@ def test_the_array_stands_beside_the_papers_table_and_a_bracket_beats_one_exposu
         (("--panoramas", "x", "--maps", "y", "--out", "z"), "--panoramas"),
         (("--panoramas", "x"), "--out"),
         (("--panoramas", "x", "--out", "z", "--variants", "best"), "--variants"),
+        (("--panoramas", "x", "--out", "z", "--merge", "mean"), "merge"),
     ],
 )
 def test_options_that_do_not_go_together_are_named(

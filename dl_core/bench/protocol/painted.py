@@ -17,6 +17,7 @@ from typing import Final
 from ...backends.loading import ModelFiles
 from ...errors import OptionError
 from ...estimate import Settings
+from ...exposure import MERGES, check_merge
 from ...imageio import read_envmap, read_exr_header
 from ...presets import Preset, preset
 from ...progress_lines import say
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="paint a last ball from the median, as the paper does, also where the preset ends in the median",
     )
+    add("--merge", default=next(iter(MERGES)), help=f"{', '.join(MERGES)}: how exposures become radiance")
     add(
         "--photographs",
         type=int,
@@ -62,12 +64,13 @@ def run(args: argparse.Namespace) -> int:
     """Paint what the folder of `--out` does not hold yet, then score every map in it.
 
     Raises:
-        OptionError: no `--out`, an unknown painter, variant or preset, no photographs or too many processes, or a
-            folder of another run.
+        OptionError: no `--out`, an unknown painter, variant or preset, no photographs or too many processes, an
+            unknown merge, or a folder of another run.
     """
     if args.out is None:
         raise OptionError("--out", None, "a folder for the painted maps")
     check_workers(args.workers)
+    check_merge(args.merge)
     variants = _names(args.variants, VARIANTS, "--variants")
     panoramas = panorama_files(args.panoramas)
     paintings = list(planned(panoramas, args.protocol, variants, args.seed, args.photographs))
@@ -80,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     started = time.perf_counter()
     files = ModelFiles.of(args)
     studio = open_studio(args.painter, files)
-    settings = Settings(seed=args.seed, canvas=studio.canvas, diameter=studio.diameter)
+    settings = Settings(seed=args.seed, merge=args.merge, canvas=studio.canvas, diameter=studio.diameter)
     baselines = open_baselines(compared, args.regressor, replace(settings, evs=chosen.evs))
     paint_maps(
         paintings,
