@@ -12,6 +12,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +31,7 @@ from ..presets import Preset
 from .cameras import Camera, Shot, cameras_of, take
 from .workers import results_of
 
-__all__ = ["VARIANTS", "PainterOf", "Painting", "Variant", "paint_maps", "planned"]
+__all__ = ["VARIANTS", "PainterOf", "Painting", "Variant", "paint_maps", "photographed", "planned"]
 
 
 @dataclass(frozen=True)
@@ -142,10 +143,7 @@ def paint_maps(
     """
     _require_same_run(folder, {"painter": painter, "preset": asdict(preset), "settings": asdict(settings)})
     wanted = [painting for painting in paintings if not painting.map_in(folder).is_file()]
-    inside = [
-        [painting for painting in wanted if painting.panorama == panorama]
-        for panorama in dict.fromkeys(painting.panorama for painting in wanted)
-    ]
+    inside = [list(group) for _, group in groupby(wanted, key=lambda painting: painting.panorama)]
     task = partial(_paint_inside, painters=painters, preset=preset, settings=settings, folder=folder)
     for number, line in enumerate(results_of(task, inside, workers), 1):
         report(f"{number}/{len(wanted)} {line}")
@@ -162,18 +160,38 @@ def _paint_inside(
 
     What variants of a photograph share is painted once.
     """
-    painter_of, light = painters(), read_envmap(paintings[0].panorama)
-    for camera in dict.fromkeys(painting.camera for painting in paintings):
-        shot = take(light, camera)
+    painter_of = painters()
+    for shot, of_shot in photographed(paintings, folder):
         painted: dict[tuple[Settings, bool], Probe] = {}
-        for painting in (painting for painting in paintings if painting.camera == camera):
+        for painting in of_shot:
             variant = VARIANTS[painting.variant]
             key = (variant.settings(preset, settings), variant.lora)
             if key not in painted:
                 painted[key] = estimate(shot.photo_ldr, painter_of(variant, shot), key[0])
-            probe = mend_map(painted[key], shot.photo_ldr, Mending(variant.front_fill, camera.longer_fov))
+            probe = mend_map(painted[key], shot.photo_ldr, Mending(variant.front_fill, painting.camera.longer_fov))
             _keep(folder, painting, shot, probe)
             yield f"{painting.shot} {variant.label}: {probe.evaluations} evaluations"
+
+
+def photographed(paintings: Sequence[Painting], folder: Path) -> Iterator[tuple[Shot, list[Painting]]]:
+    """The photographs that maps are wanted of, each taken once, with its paintings.
+
+    Args:
+        paintings: as `planned` orders them.
+        folder: of the run; it holds a photograph's true map once the photograph is given.
+
+    Raises:
+        ImageError: a panorama cannot be read.
+        OutputError: the folder cannot be written.
+    """
+    for panorama, inside in groupby(paintings, key=lambda painting: painting.panorama):
+        light = read_envmap(panorama)
+        for camera, group in groupby(inside, key=lambda painting: painting.camera):
+            shot, of_shot = take(light, camera), list(group)
+            truth = of_shot[0].truth_in(folder)
+            truth.parent.mkdir(parents=True, exist_ok=True)
+            write_exr(truth, shot.truth_hdr[0], metadata={})
+            yield shot, of_shot
 
 
 def _require_same_run(folder: Path, options: dict[str, Any]) -> None:
@@ -187,11 +205,10 @@ def _require_same_run(folder: Path, options: dict[str, Any]) -> None:
 
 
 def _keep(folder: Path, painting: Painting, shot: Shot, probe: Probe) -> None:
-    """Write truth, sheet and map; the map last, for it says that the others are there."""
-    truth, sheet, path = painting.truth_in(folder), painting.sheet_in(folder), painting.map_in(folder)
-    for place in (truth, sheet, path):
+    """Write sheet and map; the map last, for it says that the others are there."""
+    sheet, path = painting.sheet_in(folder), painting.map_in(folder)
+    for place in (sheet, path):
         place.parent.mkdir(parents=True, exist_ok=True)
-    write_exr(truth, shot.truth_hdr[0], metadata={})
     write_png(sheet, _sheet(shot, probe))
     write_exr(path, probe.latlong_hdr[0], metadata={"lightprobe:nfe": str(probe.evaluations)})
 

@@ -19,8 +19,8 @@ from ...painter import Painter
 from ...resize import resize_latlong
 from ...shapes import Image, Latlong
 from ...training.mini.mean_light import MEAN_FILE
-from ..cameras import Shot, take
-from ..paintings import Painting
+from ..cameras import Shot
+from ..paintings import Painting, photographed
 from ..perfect import PerfectPainter, RoundTripPainter
 
 __all__ = ["BASELINES", "Answer", "answer_maps", "open_baselines"]
@@ -127,16 +127,10 @@ def answer_maps(
     Raises:
         OutputError: the folder cannot be written.
     """
-    for painting in paintings:
-        path = painting.map_in(folder)
-        if path.is_file():
-            continue
-        shot = take(read_envmap(painting.panorama), painting.camera)
-        answer = baselines[painting.variant](shot)
-        for place, light, metadata in (
-            (painting.truth_in(folder), shot.truth_hdr, {}),
-            (path, answer.latlong_hdr, {"lightprobe:nfe": str(answer.evaluations)}),
-        ):
-            place.parent.mkdir(parents=True, exist_ok=True)
-            write_exr(place, light[0], metadata=metadata)
-        report(f"{painting.shot} {BASELINES[painting.variant]}")
+    wanted = [painting for painting in paintings if not painting.map_in(folder).is_file()]
+    for shot, of_shot in photographed(wanted, folder):
+        for painting in of_shot:
+            answer, path = baselines[painting.variant](shot), painting.map_in(folder)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_exr(path, answer.latlong_hdr[0], metadata={"lightprobe:nfe": str(answer.evaluations)})
+            report(f"{painting.shot} {BASELINES[painting.variant]}")

@@ -48,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="paint a last ball from the median, as the paper does, also where the preset ends in the median",
     )
-    add("--merge", default=next(iter(MERGES)), help=f"{', '.join(MERGES)}: how exposures become radiance")
+    merge = next(iter(MERGES))
+    add("--merge", default=merge, help=f"{', '.join(MERGES)}: how exposures become radiance (default: {merge})")
     add(
         "--photographs",
         type=int,
