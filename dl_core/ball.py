@@ -29,6 +29,7 @@ __all__ = [
     "crop_disc",
     "disc_mask",
     "fit_canvas",
+    "inscribed_disc",
     "paint_depth",
     "paste_ball",
     "paste_on_photograph",
@@ -259,7 +260,12 @@ def crop_ball(image: Image, ball: Ball) -> BallImage:
 
 def crop_disc(ball: Ball) -> Float[Tensor, "d d"]:
     """The ball's disc in its crop: (diameter, diameter), 1 where a pixel's centre lies on the ball, 0 outside."""
-    return crop_ball(disc_mask(ball)[..., None], ball)[0, ..., 0]
+    return inscribed_disc(ball.diameter)
+
+
+def inscribed_disc(diameter: int) -> Float[Tensor, "d d"]:
+    """The disc of a ball that fills a square picture: (diameter, diameter), as `crop_disc` of any ball so large."""
+    return disc_mask(Ball(0, 0, diameter, diameter, dilation=0))[0]
 
 
 def paste_ball(image: Image, crop: Float[Tensor, "n d d c"], ball: Ball) -> Image:

@@ -71,7 +71,7 @@ class Choice:
 
 def painted_balls(rounds: Rounds) -> int:
     """Balls that a schedule paints at one exposure, at most."""
-    return 1 if rounds.rounds == 0 else rounds.most * rounds.rounds + rounds.final
+    return 1 if rounds.rounds == 0 else rounds.most * rounds.rounds + rounds.final + rounds.light_balls
 
 
 def calibrate(painter: Painter, canvas: int, diameter: int, clock: Callable[[], float] = perf_counter) -> Pace:

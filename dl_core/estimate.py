@@ -5,7 +5,7 @@ Source: DiffusionLight, Fig. 2 (overview) and Sec. 4.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -22,6 +22,7 @@ from .geometry import ball_to_latlong
 from .iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations, tell_spared
 from .painter import Observer, Painter, PaintRequest, SilentObserver
 from .presets import PAPER_EVS
+from .restored_lights import restore_lights
 from .shapes import BallImage, Image, Latlong
 
 __all__ = [
@@ -81,7 +82,7 @@ class Probe:
 
     Attributes:
         latlong_hdr: (1, H, 2H, 3) linear radiance; EV 0 white is 1.
-        ball_hdr: (1, D, D, 3) linear radiance.
+        ball_hdr: (1, D, D, 3) linear radiance, its lights restored if the schedule has light balls.
         evs: exposure values painted, descending from 0.
         exposures: the result at each of them.
         composite_ldr: (1, S, S, 3) the photograph with the EV 0 ball, display-encoded.
@@ -190,8 +191,10 @@ def estimate(
     request = PaintRequest(canvas, paint_depth(depth, ball), ball, 0.0, (settings.seed,))
     exposures = _paint_bracket(painter, request, settings, evs, observer, depth_of)
     painted = evs[: len(exposures)]
-    balls = [exposure.ball for exposure in exposures]
-    ball_hdr = merge_bracket(balls, painted, settings.merge)
+    ball_hdr = merge_bracket([exposure.ball for exposure in exposures], painted, settings.merge)
+    if settings.rounds.light_balls:
+        whole_hdr = torch.cat([merge_bracket(balls, painted, settings.merge) for balls in _whole_brackets(exposures)])
+        ball_hdr = restore_lights(ball_hdr, whole_hdr)
     latlong_hdr = ball_to_latlong(ball_hdr, settings.height, painted=True)
     return Probe(
         latlong_hdr=latlong_hdr,
@@ -202,7 +205,7 @@ def estimate(
         ball=ball,
         settings=settings,
         evaluations=sum(exposure.evaluations for exposure in exposures),
-        clipped=_clipped_share(balls, painted, settings.merge, ball),
+        clipped=_clipped_share(exposures, painted, settings.merge, ball),
         confidence=_confidence(exposures, painted, latlong_hdr),
     )
 
@@ -226,24 +229,33 @@ def _paint_bracket(
     for ev in evs:
         if exposures and looks_at_clipping:
             balls, brighter = [exposure.ball for exposure in exposures], evs[: len(exposures)]
-            hidden = hidden_radiance(balls, brighter, evs[-1], settings.merge)
-            known = merge_bracket(balls, brighter, settings.merge)
-            if settings.bracket == "scene" and not _matters(hidden, known, request.ball):
+            if settings.bracket == "scene" and not _matters(exposures, brighter, evs[-1], settings.merge, request.ball):
                 break
-            used = (hidden > 0).any(dim=-1).to(hidden)
+            used = (hidden_radiance(balls, brighter, evs[-1], settings.merge) > 0).any(dim=-1).to(balls[0])
         asked = replace(request, ev=ev)
         exposures.append(iterative_inpaint(painter, asked, settings.rounds, observer, depth_of=depth_of, used=used))
     tell_spared(observer, rounds_evaluations(painter, settings.rounds) * (len(evs) - len(exposures)))
     return tuple(exposures)
 
 
-def _matters(hidden: BallImage, known: BallImage, ball: Ball) -> bool:
-    """Whether what is hidden could be more than the share of the energy that may stay hidden.
+def _whole_brackets(exposures: Sequence[IterativeResult]) -> list[list[BallImage]]:
+    """The balls that show how bright lights are, each with its own exposures: of one seed, so of one scene."""
+    return [list(balls) for balls in zip(*(exposure.whole_balls.split(1) for exposure in exposures), strict=True)]
+
+
+def _matters(
+    exposures: Sequence[IterativeResult], evs: tuple[float, ...], darkest: float, merge: str, ball: Ball
+) -> bool:
+    """Whether what further exposures could add is more than the share of the energy that may stay hidden.
 
     Sums over the ball's pixels are energies: each covers the same solid angle.
     """
     disc = crop_disc(ball)[None, ..., None]
-    return float((hidden * disc).sum()) > HIDDEN_SHARE * float((known * disc).sum())
+    hidden, known = 0.0, 0.0
+    for balls in _whole_brackets(exposures):
+        hidden += float((hidden_radiance(balls, evs, darkest, merge) * disc).sum())
+        known += float((merge_bracket(balls, evs, merge) * disc).sum())
+    return hidden > HIDDEN_SHARE * known
 
 
 def _confidence(
@@ -255,11 +267,11 @@ def _confidence(
     return confidence_of(bracket_spread(opinions, evs), latlong_hdr)
 
 
-def _clipped_share(balls: list[BallImage], evs: tuple[float, ...], merge: str, ball: Ball) -> float:
-    """Share of the ball where the merge would take from a further exposure."""
+def _clipped_share(exposures: Sequence[IterativeResult], evs: tuple[float, ...], merge: str, ball: Ball) -> float:
+    """Share of the ball where the merge would take from a further exposure: the mean over the balls with lights."""
     disc = crop_disc(ball)[None]
-    hidden = hidden_radiance(balls, evs, evs[-1] - 1, merge)
-    return float(((hidden > 0).any(dim=-1) * disc).sum() / disc.sum())
+    hidden = [hidden_radiance(balls, evs, evs[-1] - 1, merge) for balls in _whole_brackets(exposures)]
+    return sum(float(((part > 0).any(dim=-1) * disc).sum() / disc.sum()) for part in hidden) / len(hidden)
 
 
 def bracket_remarks(probe: Probe) -> list[str]:

@@ -56,6 +56,8 @@ class Rounds:
         min_balls: fewest balls of a round with a tolerance, N being the most in any case.
         reject: whether balls unlike the others are left out of medians without a tolerance, too, and replaced, up to
             half as many as N.
+        light_balls: balls painted to the end besides, from noise alone, with the lights of which the merged answer is
+            given back what medians lose (`restored_lights`); 0 leaves a median as it is. A last ball has lights.
     """
 
     balls: int = 30
@@ -67,6 +69,7 @@ class Rounds:
     tolerance: float | None = None
     min_balls: int = 6
     reject: bool = False
+    light_balls: int = 0
 
     def __post_init__(self) -> None:
         if not 1 <= self.balls <= 1000:
@@ -83,6 +86,16 @@ class Rounds:
             raise OptionError("tolerance", self.tolerance, "above 0, below 1, in display values; or none")
         if not 3 <= self.min_balls <= 1000:
             raise OptionError("min_balls", self.min_balls, "3 to 1000 balls")
+        if not 0 <= self.light_balls <= 1000:
+            raise OptionError("light_balls", self.light_balls, "0 to 1000")
+        if self.light_balls and not self.ends_in_median:
+            accepted = "0 where the answer is a ball painted to the end rather than a median"
+            raise OptionError("light_balls", self.light_balls, accepted)
+
+    @property
+    def ends_in_median(self) -> bool:
+        """Whether the answer is a median rather than a ball painted to the end."""
+        return self.rounds > 0 and not self.final
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -136,6 +149,7 @@ class IterativeResult:
         evaluations: denoiser evaluations spent.
         tallies: what became of each round.
         notes: what the painter had to say (`painter.PaintResult`), in order.
+        light_balls: (M, D, D, 3) balls painted to the end for their lights; None where none were.
     """
 
     ball: BallImage
@@ -145,6 +159,12 @@ class IterativeResult:
     evaluations: int
     notes: tuple[str, ...] = ()
     tallies: tuple[Tally, ...] = ()
+    light_balls: Float[Tensor, "m d d c"] | None = None
+
+    @property
+    def whole_balls(self) -> Float[Tensor, "m d d c"]:
+        """Balls that show how bright lights are: those painted for it, or else the answer."""
+        return self.ball if self.light_balls is None else self.light_balls
 
 
 def iterative_inpaint(
@@ -201,9 +221,11 @@ def iterative_inpaint(
         tell_spared(observer, painter.evaluations(unpainted, rounds.steps, strength, rounds.until))
         return balls
 
-    def found(ball: BallImage, median: BallImage, balls: Float[Tensor, "n d d c"]) -> IterativeResult:
+    def found(
+        ball: BallImage, median: BallImage, balls: Float[Tensor, "n d d c"], light_balls: Tensor | None = None
+    ) -> IterativeResult:
         spread = pixelwise_spread(balls)
-        return IterativeResult(ball, median, spread, balls, sum(spent), tuple(notes), tuple(tallies))
+        return IterativeResult(ball, median, spread, balls, sum(spent), tuple(notes), tuple(tallies), light_balls)
 
     if rounds.rounds == 0:
         ball = inpaint_balls((seed,), 1.0)
@@ -215,7 +237,10 @@ def iterative_inpaint(
         median = pixelwise_median(balls)
         scene = _with_median(request, median, depth_of)
     ball = inpaint_balls((seed,), rounds.strength) if rounds.final else median
-    return found(ball, median, balls)
+    if not rounds.light_balls:
+        return found(ball, median, balls)
+    scene = request  # from noise alone: a ball painted from the median would be as soft as it
+    return found(ball, median, balls, inpaint_balls(tuple(range(seed, seed + rounds.light_balls)), 1.0))
 
 
 def _settle(
@@ -295,7 +320,8 @@ def _counted(cost: Callable[[int, int, float, float], int], rounds: Rounds) -> i
     first = cost(rounds.most, rounds.steps, 1.0, rounds.until)
     again = cost(rounds.most, rounds.steps, rounds.strength, rounds.until) * (rounds.rounds - 1)
     last = cost(1, rounds.steps, rounds.strength, 1.0) if rounds.final else 0
-    return first + again + last
+    lights = cost(rounds.light_balls, rounds.steps, 1.0, 1.0) if rounds.light_balls else 0
+    return first + again + last + lights
 
 
 def tally_lines(result: IterativeResult, rounds: Rounds) -> list[str]:

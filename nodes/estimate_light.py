@@ -48,6 +48,7 @@ from .painting import (
     depth_model_input,
     exposure_lines,
     guidance_of,
+    light_balls_input,
     model_input,
     network_inputs,
     one_picture,
@@ -128,6 +129,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
                     "the one above, by a short calibration that counts. 0: the preset above.",
                 ),
                 reject_input(),
+                light_balls_input(),
                 *mending_inputs(),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
@@ -174,6 +176,7 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         bracket: str = "fixed",
         budget: float = 0.0,
         reject: bool = False,
+        light_balls: int = 0,
         **options: Any,
     ) -> io.NodeOutput:
         """Steer one painter to each exposure, and estimate."""
@@ -183,9 +186,12 @@ class EstimateLight(io.ComfyNode):  # type: ignore[misc]
         told = []
         if budget:
             pace_of = _bracket_painter(BarObserver(), clip, prompts, (0.0,), ev_min, options, finished=None)
-            choice = choose(budget, pace_of, canvas, diameter, _presets(values, tolerance, min_balls, reject))
+            choice = choose(
+                budget, pace_of, canvas, diameter, _presets(values, tolerance, min_balls, reject, light_balls)
+            )
             preset, told = choice.name, [choice.line(budget)]
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until, reject)
+        rest = (tolerance, min_balls, until, reject, light_balls)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, *rest)
         disc = _preset_disc(preset) if depth_disc == BY_PRESET else depth_disc
         place = (canvas, diameter, given(x), given(y), height, disc)
         settings = Settings(schedule, values, seed, merge, *place, bracket=bracket, darkest=ev_min)
@@ -207,13 +213,20 @@ def _confidence(probe: Probe) -> torch.Tensor:
     return probe.confidence.map[..., 0]
 
 
-def _presets(evs: tuple[float, ...], tolerance: float, min_balls: int, reject: bool) -> dict[str, Preset]:
-    """The presets as this node would run them."""
+def _presets(
+    evs: tuple[float, ...], tolerance: float, min_balls: int, reject: bool, light_balls: int
+) -> dict[str, Preset]:
+    """The presets as this node would run them; with light balls those that take them."""
     return {
         name: replace(
-            row, evs=evs, rounds=replace(row.rounds, tolerance=tolerance or None, min_balls=min_balls, reject=reject)
+            row,
+            evs=evs,
+            rounds=replace(
+                row.rounds, tolerance=tolerance or None, min_balls=min_balls, reject=reject, light_balls=light_balls
+            ),
         )
         for name, row in PRESETS.items()
+        if row.rounds.ends_in_median or not light_balls
     }
 
 

@@ -13,6 +13,7 @@ from comfy_api.latest import io
 from ..dl_core.errors import ModelError, OptionError
 from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
 from ..dl_core.prompts import DARK_PROMPT, PROMPT
+from ..dl_core.restored_lights import restore_lights
 from .lora import read_lora_file, with_lora
 from .sockets import CATEGORY, as_rgb, named_output, parse_evs, parse_numbers
 
@@ -287,6 +288,12 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
                     force_input=True,
                     tooltip="Reports of the nodes that painted the balls, to be passed on as one.",
                 ),
+                io.Image.Input(
+                    "light_balls",
+                    optional=True,
+                    tooltip="light_balls of Iterative Median, one batch per EV: their lights are given back to the "
+                    "merged ball, a median, which has lost them.",
+                ),
             ],
             outputs=[
                 named_output(io.Image, "hdr", "The ball in linear radiance, unbounded."),
@@ -302,7 +309,28 @@ class HDRMerge(io.ComfyNode):  # type: ignore[misc]
         method: Sequence[str],
         gamma: Sequence[float],
         report: Sequence[str] = (),
+        light_balls: Sequence[torch.Tensor] = (),
     ) -> io.NodeOutput:
         """Merge; every input is a list, options have one item."""
         merged = merge_bracket([as_rgb(ball, "balls") for ball in balls], ev, method[0], gamma[0])
+        if light_balls:
+            batches = [as_rgb(batch, "light_balls") for batch in light_balls]
+            merged = _with_lights(merged, batches, ev, method[0], gamma[0])
         return io.NodeOutput(merged, "\n".join([*report, merge_summary(ev, method[0], gamma[0])]))
+
+
+def _with_lights(
+    merged: torch.Tensor, batches: Sequence[torch.Tensor], evs: Sequence[float], method: str, gamma: float
+) -> torch.Tensor:
+    """A merged ball with the lights of others.
+
+    Raises:
+        OptionError: not one batch per EV, or batches of different sizes.
+        ImageError: balls of another size.
+    """
+    counts = [len(batch) for batch in batches]
+    if len(counts) != len(evs) or len(set(counts)) != 1 or not counts[0]:
+        raise OptionError("light_balls", counts, f"as many balls at every EV, 1 or more in each of {len(evs)} batches")
+    brackets = zip(*(batch.split(1) for batch in batches), strict=True)
+    whole = torch.cat([merge_bracket(bracket, evs, method, gamma) for bracket in brackets])
+    return restore_lights(merged, whole)

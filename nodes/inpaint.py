@@ -25,6 +25,7 @@ from .painting import (
     depth_model_input,
     exposure_lines,
     guidance_of,
+    light_balls_input,
     model_input,
     network_inputs,
     one_picture,
@@ -167,6 +168,7 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 depth_model_input("Without one all rounds use depth."),
                 *settling_inputs(),
                 reject_input(),
+                light_balls_input(),
             ],
             hidden=[io.Hidden.prompt, io.Hidden.unique_id],
             outputs=[
@@ -176,6 +178,9 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
                 named_output(io.Image, "composite", "The canvas image with the answer pasted in."),
                 named_output(io.String, "report", "What was run and what it cost."),
                 named_output(io.Image, "balls", "The balls of the last median, cut out, for Confidence Map."),
+                named_output(
+                    io.Image, "light_balls", "Balls painted to the end, for HDR Merge; without any the answer itself."
+                ),
             ],
         )
 
@@ -199,10 +204,12 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         min_balls: int = Rounds.min_balls,
         until: float = 1.0,
         reject: bool = False,
+        light_balls: int = 0,
         **options: Any,
     ) -> io.NodeOutput:
         """Run Algorithm 1."""
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until, reject)
+        rest = (tolerance, min_balls, until, reject, light_balls)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, *rest)
         request = _request(image, depth, ball, ev, (seed,))
         observer = BarObserver()
         painter = _painter(observer, ball, mask, options)
@@ -212,5 +219,6 @@ class IterativeMedian(io.ComfyNode):  # type: ignore[misc]
         lines = [exposure_lines(ev, seed, schedule, result, perf_counter() - started)]
         if ev == 0:  # once a bracket
             lines += doubts(cls.hidden, preset, options["model"])
-        composite = paste_ball(request.canvas, result.ball, ball)
-        return io.NodeOutput(result.ball, result.median, result.spread, composite, "\n".join(lines), result.balls)
+        composite, report = paste_ball(request.canvas, result.ball, ball), "\n".join(lines)
+        pictures = (result.ball, result.median, result.spread, composite)
+        return io.NodeOutput(*pictures, report, result.balls, result.whole_balls)

@@ -161,6 +161,19 @@ def reject_input() -> Any:
     )
 
 
+def light_balls_input() -> Any:
+    """How many balls tell how bright lights are."""
+    return io.Int.Input(
+        "light_balls",
+        default=0,
+        min=0,
+        max=1000,
+        optional=True,
+        tooltip="Balls to paint to the end besides, whose lights are given back to the median, which loses them; 5 are "
+        "enough. For answers that are medians: final off, or the presets draft, fast, balanced and best. 0: none.",
+    )
+
+
 def sampling_inputs() -> list[Any]:
     """How every node that paints samples."""
     return [
@@ -238,6 +251,7 @@ def rounds_of(
     min_balls: int = Rounds.min_balls,
     until: float = 1.0,
     reject: bool = False,
+    light_balls: int = 0,
 ) -> Rounds:
     """The schedule of a preset, or of the node's own values; with a tolerance above 0, until medians are settled.
 
@@ -245,7 +259,7 @@ def rounds_of(
         OptionError: an option out of range.
     """
     schedule = Rounds(balls, rounds, strength, steps, final, until) if name == CUSTOM else preset(name).rounds
-    return replace(schedule, tolerance=tolerance or None, min_balls=min_balls, reject=reject)
+    return replace(schedule, tolerance=tolerance or None, min_balls=min_balls, reject=reject, light_balls=light_balls)
 
 
 def guidance_of(options: dict[str, Any]) -> Guidance:
@@ -287,9 +301,10 @@ def exposure_lines(ev: float, seed: int, schedule: Rounds, result: IterativeResu
     """What was run at an exposure, what it cost, how far its balls agree; one line, and one for each note."""
     most = "" if schedule.tolerance is None else "up to "
     until = "" if schedule.until == 1 else f" until {schedule.until:g}"
+    lights = f", {schedule.light_balls} light balls" if schedule.light_balls else ""
     line = (
         f"EV {ev:g}: {most}{schedule.balls} balls, {schedule.rounds} rounds, {schedule.steps} steps{until}, "
-        f"strength {schedule.strength:g}, seed {seed}; {result.evaluations} denoiser evaluations "
+        f"strength {schedule.strength:g}{lights}, seed {seed}; {result.evaluations} denoiser evaluations "
         f"in {seconds:.1f} s; mean spread {float(result.spread.mean()):.3f}"
     )
     return "\n".join((line, *(f"EV {ev:g}: {note}" for note in (*result.notes, *tally_lines(result, schedule)))))

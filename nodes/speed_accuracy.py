@@ -6,7 +6,7 @@ from comfy_api.latest import io
 
 from ..dl_core.exposure import check_evs
 from ..dl_core.iterative import Rounds
-from .painting import rounds_inputs, rounds_of, settling_inputs
+from .painting import light_balls_input, rounds_inputs, rounds_of, settling_inputs
 from .sockets import CATEGORY, named_output, parse_evs
 
 __all__ = ["SpeedAccuracyChart"]
@@ -29,6 +29,7 @@ class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
                 io.Int.Input("steps", default=30, min=1, max=998, tooltip="Denoising steps of a full schedule."),
                 *settling_inputs(),
                 io.String.Input("evs", default="0, -2.5, -5", tooltip="Exposures, descending from 0."),
+                light_balls_input(),
             ],
             outputs=[
                 named_output(io.Image, "chart", "Four errors against evaluations; the line is the front."),
@@ -49,10 +50,12 @@ class SpeedAccuracyChart(io.ComfyNode):  # type: ignore[misc]
         tolerance: float = 0.0,
         min_balls: int = Rounds.min_balls,
         until: float = 1.0,
+        light_balls: int = 0,
     ) -> io.NodeOutput:
         """Draw the chart."""
         # matplotlib takes a second to import, which no other node should wait for.
         from ..dl_core.bench.pareto.shipped_chart import chart_of
 
-        schedule = rounds_of(preset, balls, rounds, strength, final, steps, tolerance, min_balls, until)
+        rest = (tolerance, min_balls, until, False, light_balls)
+        schedule = rounds_of(preset, balls, rounds, strength, final, steps, *rest)
         return io.NodeOutput(*chart_of(schedule, check_evs(parse_evs(evs))))

@@ -65,9 +65,10 @@ def test_calibration_tells_evaluations_from_balls(evaluation: float, ball: float
     rounds=st.integers(0, 3),
     steps=st.integers(2, 8),
     final=st.booleans(),
+    lights=st.integers(0, 3),
 )
-def test_the_time_foretold_is_the_time_taken(balls: int, rounds: int, steps: int, final: bool) -> None:
-    schedule = Rounds(balls, rounds, 0.8, steps, final)
+def test_the_time_foretold_is_the_time_taken(balls: int, rounds: int, steps: int, final: bool, lights: int) -> None:
+    schedule = Rounds(balls, rounds, 0.8, steps, final, light_balls=0 if final or not rounds else lights)
     painter = Timed(0.25, 1.5, loading=0.0)
     evs = (0.0, -2.5, -5.0)
     for _ in evs:

@@ -52,7 +52,7 @@ class Variant:
 
     def settings(self, preset: Preset, base: Settings) -> Settings:
         """What to estimate: the preset's schedule and bracket, less what this row goes without."""
-        rounds = preset.rounds if self.iterative else replace(preset.rounds, rounds=0)
+        rounds = preset.rounds if self.iterative else replace(preset.rounds, rounds=0, light_balls=0)
         return replace(base, rounds=rounds, evs=preset.evs if self.lora else preset.evs[:1])
 
 

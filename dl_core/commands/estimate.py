@@ -50,6 +50,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="leave balls unlike the others out, and replace them",
     )
+    add(
+        "--light-balls",
+        type=int,
+        default=0,
+        help="balls to paint to the end besides, whose lights are given back to a median, which loses them; with "
+        "draft, fast, balanced and best; 5 are enough (default: 0, none)",
+    )
     add("--merge", default="robust", help="robust, channel or paper: how exposures become radiance (default: robust)")
     add("--height", type=int, default=256, help="rows of the map, half its width (default: 256)")
     add(

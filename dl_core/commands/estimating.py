@@ -168,7 +168,13 @@ def _mending(args: argparse.Namespace) -> tuple[Mending, list[str]]:
 def _preset(args: argparse.Namespace, name: str) -> Preset:
     """A preset with what the command line replaces of it."""
     chosen = preset(name)
-    rounds = replace(chosen.rounds, tolerance=args.tolerance, min_balls=args.min_balls, reject=args.reject)
+    rounds = replace(
+        chosen.rounds,
+        tolerance=args.tolerance,
+        min_balls=args.min_balls,
+        reject=args.reject,
+        light_balls=args.light_balls,
+    )
     return replace(chosen, rounds=rounds, evs=chosen.evs if args.evs is None else parse_evs(args.evs))
 
 
@@ -176,7 +182,8 @@ def _choose(args: argparse.Namespace, loaded: LoadedPainter) -> tuple[str, list[
     """The preset asked for, or the best one in the time budget, and what to say of it."""
     if args.budget is None:
         return args.preset or DEFAULT_PRESET, []
-    presets = {name: _preset(args, name) for name in PRESETS}
+    able = [name for name, row in PRESETS.items() if row.rounds.ends_in_median or not args.light_balls]
+    presets = {name: _preset(args, name) for name in able}
     choice = choose(args.budget, loaded.painter, loaded.canvas, args.diameter or loaded.diameter, presets)
     return choice.name, [choice.line(args.budget)]
 
@@ -224,7 +231,8 @@ def _schedule(rounds: Rounds) -> str:
     if rounds.tolerance is not None:
         balls = f"N={rounds.counts[0]}-{rounds.balls} tolerance={rounds.tolerance:g}"
     until = "" if rounds.until == 1 else f" until={rounds.until:g}"
-    return f"{balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}{until}"
+    lights = f", lights of {rounds.light_balls} whole balls" if rounds.light_balls else ""
+    return f"{balls} k={rounds.rounds} strength={rounds.strength:g} steps={rounds.steps}{until}{lights}"
 
 
 def _write(outputs: _Outputs, probe: Probe, extra: dict[str, str]) -> list[Path]:

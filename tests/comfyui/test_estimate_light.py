@@ -52,7 +52,13 @@ def whole(node: Nodes, graph: Any, **changes: Any) -> Any:
 
 
 def single_nodes(
-    node: Nodes, graph: Any, merge: str = "robust", depth: Any = None, depth_model: Any = None, **place: Any
+    node: Nodes,
+    graph: Any,
+    merge: str = "robust",
+    depth: Any = None,
+    depth_model: Any = None,
+    rounds: dict[str, Any] = ROUNDS,
+    **place: Any,
 ) -> Any:
     """The same of the single nodes, wired as in the workflows."""
     canvas, control, mask, ball = (
@@ -66,11 +72,12 @@ def single_nodes(
     networks["negative"] = graph.clip.encode_from_tokens_scheduled(graph.clip.tokenize("matte"))
     places = {"image": canvas, "depth": control, "mask": mask, "ball": ball, "depth_model": depth_model}
     painted = [
-        node("IterativeMedian").execute(positive=positive, ev=ev, **networks, **places, **ROUNDS, **SAMPLING).args
+        node("IterativeMedian").execute(positive=positive, ev=ev, **networks, **places, **rounds, **SAMPLING).args
         for positive, ev in zip(positives, evs, strict=True)
     ]
     balls, reports = [item[0] for item in painted], [item[4] for item in painted]
-    hdr, report = node("HDRMerge").execute(balls, evs, [merge], [2.4], reports).args
+    lights = [item[6] for item in painted]
+    hdr, report = node("HDRMerge").execute(balls, evs, [merge], [2.4], reports, lights).args
     latlong, _ = node("BallToEquirect").execute(hdr, height=32, yaw=0.0, samples=1).args
     trusted, _, _, line = node("ConfidenceMap").execute([item[5] for item in painted], evs, [latlong]).args
     return latlong, hdr, painted[0][3], torch.cat(balls), ball, report, trusted, line
@@ -113,6 +120,19 @@ def test_pictures_are_those_of_the_single_nodes(node: Nodes, graph: Any, changes
     # Equal pictures say nothing unless they differ from each other and from the photograph's.
     balls = ours[3]
     assert all((a - b).abs().max() > 1e-3 for a, b in ((balls[0], balls[1]), (balls[1], balls[2])))
+
+
+def test_lights_are_given_back_as_by_the_single_nodes(node: Nodes, graph: Any) -> None:
+    rounds = {**ROUNDS, "rounds": 1, "final": False, "light_balls": 2}
+    ours = whole(node, graph, **rounds)
+    forget()
+    theirs = single_nodes(node, graph, rounds=rounds)
+    for one, other in zip(ours[:4], theirs[:4], strict=True):
+        assert torch.equal(one, other)
+    assert "2 light balls" in ours[5]
+    dull = whole(node, graph, **(rounds | {"light_balls": 0}))
+    assert (ours[1] >= dull[1]).all()
+    assert (ours[1] > dull[1]).any()
 
 
 def test_it_takes_the_balls_that_the_single_nodes_painted(node: Nodes, graph: Any) -> None:

@@ -30,6 +30,7 @@ MOST = {
     "balls": 3,
     "min_balls": 3,
     "count": 3,
+    "light_balls": 2,
     "rounds": 1,
     "samples": 2,
     "rows": 2,
@@ -39,7 +40,7 @@ MOST = {
 }
 """Largest values of widgets that would only cost time."""
 LISTS = {
-    "HDRMerge": ("balls", "ev"),
+    "HDRMerge": ("balls", "ev", "light_balls"),
     "ConfidenceMap": ("balls", "ev"),
     "ProbeQuality": ("balls",),
     "FitBall": ("balls",),

@@ -254,7 +254,8 @@ def test_balls_are_painted_and_pasted(node: Nodes, graph: Any, scene: Any) -> No
 
 def test_iterative_median_is_algorithm_1(node: Nodes, graph: Any, scene: Any) -> None:
     output = node("IterativeMedian").execute(ev=-2.5, **ROUNDS, **inputs(graph, scene))
-    ball, median, spread, composite, report, balls = output.args
+    ball, median, spread, composite, report, balls, light_balls = output.args
+    assert torch.equal(light_balls, ball)
     assert torch.equal(pack_module("dl_core.median").pixelwise_median(balls), median)
     assert ball.shape == median.shape == spread.shape == (1, 32, 32, 3)
     assert (spread >= 0).all()
@@ -396,6 +397,33 @@ def test_merge_gathers_lists_and_returns_radiance(node: Nodes, method: str) -> N
     torch.testing.assert_close(merged, radiance, rtol=1e-3, atol=1e-3)
     assert report.splitlines()[:2] == ["one", "two"]
     assert f"EV 0, -2.5, -5 by the method {method}" in report
+
+
+def test_merge_gives_lights_back(node: Nodes) -> None:
+    """A lamp that every ball has elsewhere: no median has it, the merged ball does, as bright as in the balls."""
+    evs = [0.0, -2.5, -5.0]
+    whole = torch.full((5, 32, 32, 3), 0.2)
+    for number, ball in enumerate(whole):
+        ball[8 + 2 * number : 10 + 2 * number, 14:16] = 20.0
+    medians = bracket(whole.median(dim=0, keepdim=True).values, evs)
+    dull, _ = node("HDRMerge").execute(medians, evs, ["robust"], [2.4]).args
+    lit, report = node("HDRMerge").execute(medians, evs, ["robust"], [2.4], ["one"], bracket(whole, evs)).args
+    assert float(dull.max()) < 0.3
+    restore = pack_module("dl_core.restored_lights").restore_lights
+    torch.testing.assert_close(lit, restore(dull, whole), rtol=1e-3, atol=1e-3)
+    assert float(lit.mean()) > float(dull.mean())
+    assert report.startswith("one")
+    # A ball is as bright as itself: what Iterative Median hands on where it painted none changes nothing.
+    same, _ = node("HDRMerge").execute(medians, evs, ["robust"], [2.4], [], medians).args
+    assert torch.equal(same, dull)
+
+
+@pytest.mark.parametrize("counts", [(2, 2), (2, 3, 2), (0, 0, 0)])
+def test_light_balls_that_are_not_as_many_at_every_ev_are_refused(node: Nodes, counts: tuple[int, ...]) -> None:
+    balls, evs = [torch.rand(1, 16, 16, 3)] * 3, [0.0, -2.5, -5.0]
+    batches = [torch.rand(count, 16, 16, 3) for count in counts]
+    with pytest.raises(errors().ProbeError, match="light_balls"):
+        node("HDRMerge").execute(balls, evs, ["robust"], [2.4], [], batches)
 
 
 @pytest.mark.parametrize(

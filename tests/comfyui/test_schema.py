@@ -22,10 +22,10 @@ SOCKETS = {
     ),
     "IterativeMedian": (
         "model positive negative vae control_net image depth ball mask ev depth_model",
-        "ball median spread composite report balls",
+        "ball median spread composite report balls light_balls",
     ),
     "CanvasToImage": ("canvas_image image ball", "image framed mask"),
-    "HDRMerge": ("balls ev report", "hdr report"),
+    "HDRMerge": ("balls ev report light_balls", "hdr report"),
     "FitBall": ("balls photograph ball", "fit report"),
     "BallToEquirect": ("image ball fit", "latlong coverage"),
     "EquirectToBall": ("latlong", "ball_image"),

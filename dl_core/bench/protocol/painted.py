@@ -48,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="paint a last ball from the median, as the paper does, also where the preset ends in the median",
     )
+    add(
+        "--light-balls",
+        type=int,
+        default=0,
+        help="balls painted to the end besides, whose lights are given back to medians (default: 0, none)",
+    )
     merge = next(iter(MERGES))
     add("--merge", default=merge, help=f"{', '.join(MERGES)}: how exposures become radiance (default: {merge})")
     add(
@@ -80,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
     chosen = preset(args.preset)
     if args.last_ball:
         chosen = replace(chosen, rounds=replace(chosen.rounds, final=True))
+    chosen = replace(chosen, rounds=replace(chosen.rounds, light_balls=args.light_balls))
     prepare_output(args)
     started = time.perf_counter()
     files = ModelFiles.of(args)
@@ -145,6 +152,7 @@ def _description(args: argparse.Namespace, settings: Settings, chosen: Preset) -
         "painter": args.painter,
         "preset": args.preset,
         "last_ball": chosen.rounds.final,
+        "light_balls": chosen.rounds.light_balls,
         "merge": settings.merge,
         "evs": list(chosen.evs),
         "canvas_px": settings.canvas,
