@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic_painter import AnalyticPainter, Flaws
+from analytic_painter import AnalyticPainter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_iterative import LIGHT, Sparing, request
@@ -17,7 +17,8 @@ from dl_core.estimate import Settings, estimate, planned_evaluations
 from dl_core.exposure import luminance
 from dl_core.iterative import Rounds, iterative_inpaint, rounds_evaluations
 from dl_core.median import pixelwise_median
-from dl_core.metrics import rgb_angles
+from dl_core.metrics import energy_kept, rgb_angles
+from dl_core.painter import Observer, PaintRequest, PaintResult
 from dl_core.restored_lights import RESTORED_SHARE, restore_lights
 
 SIDE = 48
@@ -142,19 +143,36 @@ def test_a_perfect_painter_s_light_stays_bit_for_bit() -> None:
     assert torch.equal(with_lights.latlong_hdr, estimate(PHOTO, AnalyticPainter(LIGHT), bare).latlong_hdr)
 
 
-def test_lights_that_noise_moves_are_nearer_their_energy() -> None:
-    """A painter whose disco balls show the lamp in other places than the mirrors do."""
-    flaws = Flaws(disco=0.9, noise=0.01)
-    canvas = Settings(replace(ROUNDS, balls=9, light_balls=5), canvas=128, diameter=64, height=32)
-    restored, bare = (
-        estimate(PHOTO, AnalyticPainter(LIGHT, flaws), replace(canvas, rounds=rounds)).ball_hdr[
-            :, inscribed_disc(64) > 0
+class Wandering:
+    """A painter that has the light right, but for its azimuth: 40 degrees further with every seed."""
+
+    def __init__(self, latlong_hdr: torch.Tensor) -> None:
+        self.latlong_hdr = latlong_hdr
+
+    def paint(self, asked: PaintRequest, observer: Observer) -> PaintResult:
+        results = [
+            AnalyticPainter(self.latlong_hdr.roll(7 * seed, 2)).paint(replace(asked, seeds=(seed,)), observer)
+            for seed in asked.seeds
         ]
-        for rounds in (canvas.rounds, replace(canvas.rounds, light_balls=0))
-    )
-    truth = estimate(PHOTO, AnalyticPainter(LIGHT), canvas).ball_hdr[:, inscribed_disc(64) > 0]
-    lost, left = (abs(float(luminance(part).mean() / luminance(truth).mean()) - 1) for part in (bare, restored))
-    assert left < lost
+        return PaintResult(torch.cat([one.balls for one in results]), sum(one.evaluations for one in results))
+
+    def evaluations(self, balls: int, steps: int, strength: float, until: float = 1.0) -> int:
+        return AnalyticPainter(self.latlong_hdr).evaluations(balls, steps, strength, until)
+
+
+def test_a_sun_that_wanders_is_lost_to_the_median_and_comes_back() -> None:
+    """Its light, and with a bracket sized to the scene the exposures that show it."""
+    light = torch.full((1, 32, 64, 3), 0.2)
+    light[:, 6:10, 30:34] = 15.0
+    asked = Settings(Rounds(9, 1, 0.8, 2, final=False), canvas=128, diameter=64, height=32, bracket="scene", darkest=-5)
+    bare = estimate(PHOTO, Wandering(light), asked)
+    lit = estimate(PHOTO, Wandering(light), replace(asked, rounds=replace(asked.rounds, light_balls=5)))
+    assert bare.evs == (0.0,)
+    assert lit.evs == (0.0, -2.5, -5.0)
+    assert bare.clipped == 0
+    assert energy_kept(bare.latlong_hdr, light) < 0.7
+    assert energy_kept(lit.latlong_hdr, light) == pytest.approx(1, abs=0.25)
+    assert float(lit.latlong_hdr.max()) > 1 > float(bare.latlong_hdr.max())
 
 
 def test_progress_is_told_of_what_is_painted() -> None:
