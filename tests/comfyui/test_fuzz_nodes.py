@@ -172,7 +172,7 @@ def test_a_node_gives_something_sound_or_says_what_is_wrong(
             continue
         value = data.draw(_values(entry, sockets), label=entry.id)
         inputs[entry.id] = [value] if kind.GET_SCHEMA().is_input_list else value
-    for listed in LISTS.get(name, ()):
+    for listed in (socket for socket in LISTS.get(name, ()) if socket in inputs):
         inputs[listed] = inputs[listed] * data.draw(st.integers(1, 3), label=f"length of {listed}")
     before = {path for path in folders.parent.rglob("*") if not path.is_relative_to(folders)}
     try:
