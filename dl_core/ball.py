@@ -335,8 +335,10 @@ def require_canvas(image: Image, ball: Ball) -> Float[Tensor, "b h w c"]:
     """The image, if it is a square canvas of the ball's size.
 
     Raises:
-        ImageError: another size.
+        ImageError: another size, or no picture.
     """
+    if not len(image):
+        raise ImageError("image", "holds no picture; one or more are accepted")
     if image.shape[1:3] != (ball.canvas, ball.canvas):
         raise ImageError(
             "image",

@@ -182,6 +182,8 @@ def test_pasting_a_crop_back_changes_nothing(generator: torch.Generator) -> None
 def test_another_canvas_is_refused_with_both_sizes() -> None:
     with pytest.raises(ImageError, match=r"40 x 48.*64 x 64"):
         require_canvas(torch.ones(1, 48, 40, 3), place_ball(64, 16))
+    with pytest.raises(ImageError, match="holds no picture"):
+        require_canvas(torch.ones(0, 64, 64, 3), place_ball(64, 16))
 
 
 # --- from the canvas back to the photograph ----------------------------------------------------------------------
