@@ -17,7 +17,7 @@ from .ball import Ball, crop_disc, fit_canvas, paint_depth, paste_ball, place_ba
 from .bracket import check_bracket, darkest_of, hidden_radiance, ladder
 from .confidence import FEWEST, Confidence, bracket_spread, confidence_of
 from .errors import ImageError, OptionError
-from .exposure import check_evs, check_merge, merge_bracket
+from .exposure import brackets_of, check_evs, check_merge, merge_batches, merge_bracket
 from .geometry import ball_to_latlong
 from .iterative import IterativeResult, Rounds, iterative_inpaint, rounds_evaluations, tell_spared
 from .painter import Observer, Painter, PaintRequest, SilentObserver
@@ -193,8 +193,8 @@ def estimate(
     painted = evs[: len(exposures)]
     ball_hdr = merge_bracket([exposure.ball for exposure in exposures], painted, settings.merge)
     if settings.rounds.light_balls:
-        whole_hdr = torch.cat([merge_bracket(balls, painted, settings.merge) for balls in _whole_brackets(exposures)])
-        ball_hdr = restore_lights(ball_hdr, whole_hdr)
+        whole = [exposure.whole_balls for exposure in exposures]
+        ball_hdr = restore_lights(ball_hdr, merge_batches(whole, painted, settings.merge))
     latlong_hdr = ball_to_latlong(ball_hdr, settings.height, painted=True)
     return Probe(
         latlong_hdr=latlong_hdr,
@@ -238,9 +238,9 @@ def _paint_bracket(
     return tuple(exposures)
 
 
-def _whole_brackets(exposures: Sequence[IterativeResult]) -> list[list[BallImage]]:
+def _whole_brackets(exposures: Sequence[IterativeResult]) -> list[tuple[BallImage, ...]]:
     """The balls that show how bright lights are, each with its own exposures: of one seed, so of one scene."""
-    return [list(balls) for balls in zip(*(exposure.whole_balls.split(1) for exposure in exposures), strict=True)]
+    return brackets_of([exposure.whole_balls for exposure in exposures])
 
 
 def _matters(

@@ -24,6 +24,7 @@ __all__ = [
     "LUMINANCE",
     "MERGES",
     "auto_exposure",
+    "brackets_of",
     "check_evs",
     "check_merge",
     "clipping",
@@ -33,6 +34,7 @@ __all__ = [
     "exposure_error",
     "exposure_ratio",
     "luminance",
+    "merge_batches",
     "merge_bracket",
     "merge_channel",
     "merge_paper",
@@ -335,3 +337,18 @@ def merge_bracket(
         OptionError: an unknown method, and what the method raises.
     """
     return MERGES[check_merge(method)](balls, evs, gamma)
+
+
+def brackets_of(batches: Sequence[Tensor]) -> list[tuple[Tensor, ...]]:
+    """Balls painted at several exposures, as many at each, as brackets: (M, ...) per EV -> M tuples of (1, ...)."""
+    return list(zip(*(batch.split(1) for batch in batches), strict=True))
+
+
+def merge_batches(
+    batches: Sequence[Tensor], evs: Sequence[float], method: str = "robust", gamma: float = GAMMA
+) -> Tensor:
+    """Merge each ball of some by itself, as exposures are measured ball by ball: (M, ..., 3) per EV -> (M, ..., 3).
+
+    Raises: as `merge_bracket`.
+    """
+    return torch.cat([merge_bracket(bracket, evs, method, gamma) for bracket in brackets_of(batches)])

@@ -78,7 +78,5 @@ def restore_lights(
 def _shared_by_equals(ordered: Float[Tensor, "n"], gains: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """The mean gain of pixels of one luminance, whose order among themselves is an accident; their energy stays."""
     _, group, counts = torch.unique_consecutive(ordered, return_inverse=True, return_counts=True)
-    if len(counts) == len(ordered):
-        return gains
     totals = torch.zeros(len(counts)).to(gains).index_add(0, group, gains)
     return (totals / counts)[group]

@@ -11,7 +11,7 @@ import torch
 from comfy_api.latest import io
 
 from ..dl_core.errors import ModelError, OptionError
-from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_bracket
+from ..dl_core.exposure import GAMMA, MERGES, check_evs, merge_batches, merge_bracket
 from ..dl_core.prompts import DARK_PROMPT, PROMPT
 from ..dl_core.restored_lights import restore_lights
 from .lora import read_lora_file, with_lora
@@ -331,6 +331,4 @@ def _with_lights(
     counts = [len(batch) for batch in batches]
     if len(counts) != len(evs) or len(set(counts)) != 1 or not counts[0]:
         raise OptionError("light_balls", counts, f"as many balls at every EV, 1 or more in each of {len(evs)} batches")
-    brackets = zip(*(batch.split(1) for batch in batches), strict=True)
-    whole = torch.cat([merge_bracket(bracket, evs, method, gamma) for bracket in brackets])
-    return restore_lights(merged, whole)
+    return restore_lights(merged, merge_batches(batches, evs, method, gamma))

@@ -84,9 +84,8 @@ def run(args: argparse.Namespace) -> int:
     compared = _names(args.baselines, BASELINES, "--baselines") if args.baselines else []
     answers = list(planned(panoramas, args.protocol, compared, args.seed, args.photographs))
     chosen = preset(args.preset)
-    if args.last_ball:
-        chosen = replace(chosen, rounds=replace(chosen.rounds, final=True))
-    chosen = replace(chosen, rounds=replace(chosen.rounds, light_balls=args.light_balls))
+    final = args.last_ball or chosen.rounds.final
+    chosen = replace(chosen, rounds=replace(chosen.rounds, final=final, light_balls=args.light_balls))
     prepare_output(args)
     started = time.perf_counter()
     files = ModelFiles.of(args)
