@@ -10,7 +10,7 @@ The ball's latents are those that a sampler which started from noise alone meets
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 import torch
 from diffusers import DDPMScheduler
@@ -41,11 +41,6 @@ _NOISE = DDPMScheduler(**SCHEDULER_CONFIG)
 
 OFF_BALL_WEIGHT = 0.1
 """Weight of latents that show the photograph; at inference they are imputed, so the ball matters more."""
-
-CHANNEL_WEIGHTS: Final = (0.64, 1.42, 1.07, 0.87)
-"""Weights of a latent's luma, red, blue and unevenness in the loss. At the noisiest levels, where a photograph leaves
-open most of a ball, the trained model's squared errors stand as 0.79, 0.16, 0.28 and 0.43 on the ball: what cannot be
-known of luma drowns what can be learnt of colour. These are as the inverse roots of those errors; their mean is 1."""
 
 
 @dataclass(frozen=True)
@@ -154,9 +149,8 @@ def latent_disc(ball: Ball, side: int, *, grow: float) -> Float[Tensor, "1 1 m m
 
 
 def velocity_loss(predicted: Tensor, batch: Batch) -> Float[Tensor, ""]:
-    """Mean squared error of the predicted velocity, weighted by place and by channel."""
-    scale = predicted.new_tensor(CHANNEL_WEIGHTS).sqrt().view(1, -1, 1, 1)
-    return weighted_error(predicted * scale, batch.target * scale, batch.weights)
+    """Weighted mean squared error of the predicted velocity."""
+    return weighted_error(predicted, batch.target, batch.weights)
 
 
 def weighted_error(predicted: Tensor, target: Tensor, weights: Float[Tensor, "b 1 m m"]) -> Float[Tensor, ""]:

@@ -34,10 +34,6 @@ TINT: Final = 0.2
 """Deviation of the random white balance of panoramas, in natural logarithms of each channel. Few maps have few colours
 of light; with this, the ball's colour has to be taken from the photograph."""
 
-BAD: Final = 0.25
-"""Share of disco, matte and tinted balls under the good ones' own words, in a base's training: three in ten of those at
-EV 0. A median passes over them and a LoRA unlearns them; without them neither has much to do."""
-
 Look = Literal["mirror", "disco", "matte", "tinted"]
 
 
@@ -159,7 +155,7 @@ def _base_kind(generator: Generator) -> tuple[Look, float, int]:
     """What a base model has seen: mostly good balls, an honest share of bad ones under the same words, dark ones."""
     draw = _uniform(generator, 0, 1)
     caption = 3 if _uniform(generator, 0, 1) < 0.08 else -1
-    if draw < 0.82 - BAD:
+    if draw < 0.70:
         look, ev, own = "mirror", 0.0, 0
     elif draw < 0.82:
         look, ev, own = ("disco", "matte", "tinted")[int(_uniform(generator, 0, 2.99))], 0.0, 0
