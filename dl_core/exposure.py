@@ -24,12 +24,14 @@ __all__ = [
     "LUMINANCE",
     "MERGES",
     "auto_exposure",
+    "borne_out",
     "brackets_of",
     "check_evs",
     "check_merge",
     "clipping",
     "decode_display",
     "encode_display",
+    "evidence_floor",
     "expose",
     "exposure_error",
     "exposure_ratio",
@@ -62,6 +64,11 @@ TRUST: Final = 0.5
 """Scatter in stops, a median absolute deviation, up to which a measured error is believed in full."""
 DISTRUST: Final = 1.0
 """Scatter in stops from which it is not believed at all."""
+ONE_PICTURE: Final = 0.27
+"""Scatter in stops that one picture reaches when it is moved, bent or tinted: 0.26 at most over the misalignments of
+`lightprobe bench oracle`, other scenes' lights aside."""
+TWO_PICTURES: Final = 0.33
+"""Scatter in stops from which exposures count as pictures of their own; the mini model's single balls have 0.3 to 1."""
 
 
 def encode_display(radiance: Tensor, gamma: float = GAMMA) -> Tensor:
@@ -188,7 +195,11 @@ def exposure_error(
     Source: Mitsunaga and Nayar, Radiometric self calibration (CVPR 1999), for exposure ratios measured from the
     pictures.
     """
-    compared = exposure_ratio(brighter, darker, stops, gamma)
+    return _believed_error(exposure_ratio(brighter, darker, stops, gamma))
+
+
+def _believed_error(compared: tuple[float, float] | None) -> float:
+    """What of a measured ratio is an error of the exposure; nothing was measured where it is None."""
     if compared is None:
         return 0.0
     error, scatter = compared
@@ -196,6 +207,17 @@ def exposure_error(
     trust = min(1.0, max(0.0, (DISTRUST - doubt) / (DISTRUST - TRUST)))
     excess = min(max(abs(error) - scatter - DEAD_ZONE, 0.0), LARGEST_ERROR)
     return math.copysign(excess, error) * trust
+
+
+def _apart(compared: tuple[float, float] | None) -> float:
+    """How far two exposures are pictures of their own, 0 to 1, by their scatter; 0 where none was measured."""
+    scatter = 0.0 if compared is None else compared[1]
+    return min(1.0, max(0.0, (scatter - ONE_PICTURE) / (TWO_PICTURES - ONE_PICTURE)))
+
+
+def evidence_floor(stops: float, gamma: float = GAMMA) -> float:
+    """Linear value from which a picture is compared with one darker by some stops, whose codes are coarser."""
+    return max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
 
 
 def exposure_ratio(
@@ -208,13 +230,45 @@ def exposure_ratio(
     Returns:
         Median and median absolute deviation of the ratios, both in stops; None for fewer than 100 values to compare.
     """
-    floor = max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
-    known = (brighter >= floor) & (brighter < CLIP_THRESHOLD)
+    known = (brighter >= evidence_floor(stops, gamma)) & (brighter < CLIP_THRESHOLD)
     if int(known.sum()) < EVIDENCE_COUNT:
         return None
     ratios = torch.log2(darker[known].clamp(min=1e-6) / brighter[known]) + stops
     error = float(ratios.detach().median())
     return error, float((ratios.detach() - error).abs().median())
+
+
+def borne_out(
+    brighter: Float[Tensor, "*n 3"], darker: Float[Tensor, "*n 3"], stops: float, gamma: float = GAMMA
+) -> Float[Tensor, "*n 3"]:
+    """Share of a darker exposure's light that a pixel's other channels bear out, by channel.
+
+    Of a warm lamp the brighter exposure clips red alone. If the darker one shows more green and blue there than the
+    brighter one, which knows better, it shows another light, and red would rise alone to a colour that neither has.
+    Where it shows c times the other channels' light, 1 / c of its own is believed.
+
+    Args:
+        brighter: linear values in [0, 1] of its own white.
+        darker: linear radiance in the same units, put right as a whole.
+        stops: between the two, above 0.
+        gamma: of the display encoding they were painted in.
+
+    Returns:
+        In (0, 1]; exactly 1 where the other channels agree within 0.05 stops, show less light, or tell nothing: those
+        that clip, and those below twice `evidence_floor`. What a channel shows itself does not enter its own share.
+    """
+    # Single pixels are compared, so both exposures' codes have to agree within the dead zone.
+    floor = 2 * evidence_floor(stops, gamma)
+    known = (1 - clipping(brighter)) * (brighter / floor - 1).clamp(0, 1)
+    weights = known * brighter
+    excess = torch.log2(darker.clamp(min=1e-6) / brighter.clamp(min=1e-6))
+    shares = []
+    for channel in range(3):
+        others = [other for other in range(3) if other != channel]
+        weight = weights[..., others]
+        mean = (weight * excess[..., others]).sum(-1) / weight.sum(-1).clamp(min=1e-6)
+        shares.append(torch.exp2(-known[..., others].amax(-1) * (mean - DEAD_ZONE).clamp(min=0)))
+    return torch.stack(shares, dim=-1)
 
 
 def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = GAMMA) -> Tensor:
@@ -223,20 +277,26 @@ def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = G
     Each darker exposure is compared with the next brighter one (`exposure_error`) and put right. It then completes
     the brighter one where that clips:
 
-        l + w(l) max(0, d - l)
+        l + w(l) max(0, s d - l)
 
     with l a value of the brighter exposure in units of its white, d what the darker ones say of it, and w rising from
     0 to 1 between 0.9 and clipping. The darker ones never darken what the brighter one shows, and add no light where
     it is not clipped: what moved, or is another scene's, leaves no ghost there.
 
+    s is 1 where exposures scatter as one picture does that is moved or bent: what it gains at one side of a light it
+    loses at the other. Where they scatter more, each is a picture of its own, as single balls of a diffusion model are,
+    and s falls to the share of the light that the pixel's other channels bear out (`borne_out`): a channel that clips
+    alone does not rise to a colour that no exposure has.
+
     Args, Returns, Raises: as `merge_paper`; any number of EVs.
 
     Warnings:
         Raising a value never lowers the result at its own pixel and channel: values that tell an error are below the
-        threshold, where nothing is taken over. Elsewhere the result rises as well, unless what was raised moves the
-        measured error of the whole exposure; on brackets that agree within 0.05 stops it does not. Errors of up to 2
-        stops between neighbours are undone, less 0.05 stops and the scatter. A light that the darker exposures show
-        elsewhere is not moved back, and ends at white.
+        threshold, where nothing is taken over. Elsewhere the result rises as well, with two exceptions: what was raised
+        moves the measured error or scatter of the whole exposure, or, where exposures are pictures of their own, shows
+        more of a channel than the brighter one, which makes the pixel's others doubtful. Errors of up to 2 stops
+        between neighbours are undone, less 0.05 stops and the scatter. A light that the darker exposures show elsewhere
+        is not moved back, and ends at white.
         Where scenes scatter, giving up a darker exposure's colour for its luminance (as `merge_paper` does) was tried
         and dropped: over photographed panoramas shifted and bent lights came out worse and lights of another scene no
         better; only on balls of different seeds were colours closer, 0.96 for 1.03 degrees of irradiance at the median.
@@ -253,8 +313,10 @@ def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = G
     merged = linear[-1]
     for i in range(len(balls) - 2, -1, -1):
         shown, stops = linear[i], evs[i] - evs[i + 1]
-        scale = 2.0 ** (stops - exposure_error(shown, linear[i + 1], stops, gamma))
-        merged = shown + clipping(shown) * (merged * scale - shown).clamp(min=0)
+        compared = exposure_ratio(shown, linear[i + 1], stops, gamma)
+        darker = merged * 2.0 ** (stops - _believed_error(compared))
+        share = borne_out(shown, darker, stops, gamma) ** _apart(compared)
+        merged = shown + clipping(shown) * (share * darker - shown).clamp(min=0)
     return merged
 
 

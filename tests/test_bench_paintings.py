@@ -21,7 +21,7 @@ from dl_core.estimate import Settings
 from dl_core.geometry import latlong_directions, latlong_energy, latlong_to_perspective
 from dl_core.imageio import read_envmap, write_exr
 from dl_core.iterative import Rounds
-from dl_core.painter import Painter
+from dl_core.painter import Observer, Painter, PaintRequest, PaintResult
 from dl_core.presets import PRESETS, Preset
 
 PRESET = Preset(Rounds(balls=2, rounds=1, steps=2, final=False), (0.0, -2.5, -5.0), "short")
@@ -111,6 +111,43 @@ def test_a_painter_without_error_gives_back_the_light(panorama: Path, tmp_path: 
     off = {name: (light[name] - truth).abs().mean(dim=-1)[0] for name in ("both", "filled")}
     assert off["filled"][ahead].mean() < 0.5 * off["both"][ahead].mean()  # the ball's rim against the photograph
     assert torch.equal(light["filled"][0, behind], light["both"][0, behind])
+
+
+class Listening(PerfectPainter):
+    """Notes which seeds it is asked for."""
+
+    def __init__(self, truth_hdr: torch.Tensor, heard: set[int]) -> None:
+        super().__init__(truth_hdr)
+        self.heard = heard
+
+    def paint(self, request: PaintRequest, observer: Observer) -> PaintResult:
+        self.heard.add(request.seeds[0])
+        return super().paint(request, observer)
+
+
+def test_each_photograph_has_noise_of_its_own(panorama: Path, tmp_path: Path) -> None:
+    """Another for every photograph, the same for all rows of one, and whatever else is in the run."""
+    other = write_exr(tmp_path / "other.exr", smooth()[0], metadata={})
+
+    def heard_in(files: list[Path], folder: str, variants: list[str]) -> set[int]:
+        heard: set[int] = set()
+        paintings = list(planned(files, "three-spheres", variants, 0, 2))
+        paint_maps(
+            paintings,
+            lambda: lambda variant, shot: Listening(shot.truth_hdr, heard),
+            PRESET,
+            replace(SETTINGS, seed=7),
+            tmp_path / folder,
+            painter="perfect",
+            report=lambda line: None,
+        )
+        assert heard == {painting.seed(7) for painting in paintings}
+        return heard
+
+    both = heard_in([panorama, other], "both", ["base", "lora"])
+    alone = heard_in([other], "alone", ["base"])
+    assert (len(both), len(alone)) == (4, 2)
+    assert alone < both
 
 
 def test_what_is_there_is_not_painted_again(panorama: Path, tmp_path: Path) -> None:

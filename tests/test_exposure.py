@@ -15,6 +15,7 @@ from dl_core.exposure import (
     GAMMA,
     MERGES,
     auto_exposure,
+    borne_out,
     check_evs,
     check_merge,
     decode_display,
@@ -303,6 +304,68 @@ def test_robust_rises_at_its_own_place_whatever_is_measured(scatter: float, gene
             raised[exposure].view(-1)[place] = value + (1 - value) * torch.rand((), generator=generator)
             after = merge_robust(raised, PAPER_EVS).reshape(-1)[place]
             assert float(after) >= float(before.reshape(-1)[place]) * (1 - 1e-6)
+
+
+# --- exposures that are pictures of their own --------------------------------------------------------------------
+
+known = st.floats(0.4, 0.89)
+"""Values that say in full what a pixel shows: twice the floor of evidence and more, and not clipped."""
+
+
+@given(known, known, st.floats(1, 8), st.floats(1.04, 50))
+def test_a_light_shown_too_bright_keeps_its_colour(green: float, blue: float, red: float, times: float) -> None:
+    """Red clips alone; the darker exposure shows the same colour, times too bright: its red is put right with it."""
+    shown, light = pixel(1.0, green, blue), pixel(red, green, blue)
+    share = borne_out(shown, times * light, 2.5)[..., 0]
+    # Less the dead zone of 0.05 stops.
+    torch.testing.assert_close(share * times * red, torch.full((1, 1, 1), red * 2**0.05), rtol=1e-4, atol=0)
+
+
+@given(known, known, st.floats(0.05, 1.03))
+def test_a_light_no_brighter_than_the_pixel_is_believed(green: float, blue: float, times: float) -> None:
+    shown = pixel(1.0, green, blue)
+    assert float(borne_out(shown, times * pixel(9.0, green, blue), 2.5)[..., 0]) == 1
+
+
+@pytest.mark.parametrize("shown", [(1.0, 1.0, 1.0), (1.0, 0.19, 0.1), (1.0, 1.0, 0.0)], ids=str)
+def test_a_pixel_that_tells_nothing_doubts_nothing(shown: tuple[float, float, float]) -> None:
+    assert float(borne_out(pixel(*shown), pixel(30.0, 30.0, 30.0), 2.5)[..., 0]) == 1
+
+
+@given(st.lists(st.floats(0, 1), min_size=3, max_size=3), st.lists(st.floats(0, 30), min_size=3, max_size=3))
+def test_a_channel_does_not_speak_for_itself(shown: list[float], darker: list[float]) -> None:
+    for channel in range(3):
+        other_shown, other_darker = list(shown), list(darker)
+        other_shown[channel], other_darker[channel] = 0.5, 7.0
+        share = borne_out(pixel(*shown), pixel(*darker), 2.5)[..., channel]
+        assert torch.equal(share, borne_out(pixel(*other_shown), pixel(*other_darker), 2.5)[..., channel])
+        assert 0 < float(share) <= 1
+
+
+def of_their_own(generator: torch.Generator, lamp: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
+    """A bracket whose exposures scatter by a stop: a dim picture with a warm glow where the darker ones have a lamp."""
+    glow = torch.zeros(1, 48, 48, 1, dtype=torch.bool)
+    glow[:, 20:26, 20:26] = True
+    dim = 0.1 + 0.7 * torch.rand(1, 48, 48, 3, generator=generator)
+    pictures = [torch.where(glow, pixel(1.3, 0.8, 0.5), dim)]
+    for _ in PAPER_EVS[1:]:
+        scattered = dim * torch.exp2(torch.randn(dim.shape, generator=generator))
+        pictures.append(torch.where(glow, lamp, scattered))
+    return [quantize(expose(picture, ev)) for picture, ev in zip(pictures, PAPER_EVS, strict=True)], glow[..., 0]
+
+
+def test_a_channel_that_clips_alone_takes_no_light_of_another_picture(generator: torch.Generator) -> None:
+    balls, glow = of_their_own(generator, pixel(6.0, 6.0, 6.0))
+    # The lamp has eight times the green and more of the blue: less than white is left of its red. Codes of 8 bits.
+    expected = torch.tensor([1.0, 0.8, 0.5]).expand(36, 3)
+    torch.testing.assert_close(merge_robust(balls, PAPER_EVS)[glow], expected, atol=6e-3, rtol=0)
+    assert float(merge_channel(balls, PAPER_EVS)[glow][:, 0].min()) > 5
+
+
+def test_a_light_of_the_pixels_colour_is_taken_from_another_picture(generator: torch.Generator) -> None:
+    balls, glow = of_their_own(generator, pixel(1.3, 0.8, 0.5))
+    # What scatter leaves of the exposure's measured error is under a tenth of a stop.
+    assert float(merge_robust(balls, PAPER_EVS)[glow][:, 0].mean()) == pytest.approx(1.3, rel=0.07)
 
 
 def test_robust_keeps_blacks_black() -> None:

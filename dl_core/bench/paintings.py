@@ -9,6 +9,7 @@ Source: DiffusionLight, Table 1 (rows) and Sec. 5.1.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -88,6 +89,14 @@ class Painting:
         """Name of the photograph, fit for a file."""
         return f"{self.panorama.stem}.{self.camera.name}"
 
+    def seed(self, seed: int) -> int:
+        """Seed of the photograph's first ball in a run of some seed.
+
+        Balls that start from the same noise are alike in any photograph (DiffusionLight, Sec. 4.1). With one seed for
+        all, a table would tell the luck of one noise; so each photograph has its own, whatever else is in the run.
+        """
+        return seed + zlib.crc32(self.shot.encode()) % 1_000_000
+
     def map_in(self, folder: Path) -> Path:
         """File of the painted map in a run's folder."""
         return folder / "maps" / self.variant / f"{self.shot}.exr"
@@ -141,7 +150,9 @@ def paint_maps(
         OptionError: the folder holds a run with other settings or of another painter.
         OutputError: the folder cannot be written.
     """
-    _require_same_run(folder, {"painter": painter, "preset": asdict(preset), "settings": asdict(settings)})
+    _require_same_run(
+        folder, {"painter": painter, "preset": asdict(preset), "settings": asdict(settings), "seeds": "photograph"}
+    )
     wanted = [painting for painting in paintings if not painting.map_in(folder).is_file()]
     inside = [list(group) for _, group in groupby(wanted, key=lambda painting: painting.panorama)]
     task = partial(_paint_inside, painters=painters, preset=preset, settings=settings, folder=folder)
@@ -165,7 +176,7 @@ def _paint_inside(
         painted: dict[tuple[Settings, bool], Probe] = {}
         for painting in of_shot:
             variant = VARIANTS[painting.variant]
-            key = (variant.settings(preset, settings), variant.lora)
+            key = (variant.settings(preset, replace(settings, seed=painting.seed(settings.seed))), variant.lora)
             if key not in painted:
                 painted[key] = estimate(shot.photo_ldr, painter_of(variant, shot), key[0])
             probe = mend_map(painted[key], shot.photo_ldr, Mending(variant.front_fill, painting.camera.longer_fov))

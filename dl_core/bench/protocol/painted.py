@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=1,
         help="of each panorama: at equal azimuths, random cameras drawn anew (default: 1, as in the paper; not array)",
     )
-    add("--seed", type=int, default=0, help="of balls and random cameras (default: 0)")
+    add("--seed", type=int, default=0, help="of random cameras, and of balls, for each photograph others (default: 0)")
     add("--workers", type=int, default=1, help="processes, each with a panorama at a time (default: 1)")
     add_files(group)
 
