@@ -146,7 +146,7 @@ def merge_input(name: str) -> Any:
     return io.Combo.Input(
         name,
         options=list(MERGES),
-        tooltip="robust: each colour by itself, errors of exposure undone. "
+        tooltip="robust: each colour by itself, errors of exposure undone, no colours from exposures that differ. "
         "channel: each colour by itself always. paper: luminance only, with the chroma of EV 0.",
     )
 
