@@ -8,7 +8,7 @@ from typing import Any, Final
 from .errors import OptionError
 from .iterative import Rounds, rounds_steps
 
-__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "preset"]
+__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "preset", "presets_taking"]
 
 
 @dataclass(frozen=True)
@@ -84,3 +84,8 @@ def preset(name: str) -> Preset:
     if name not in PRESETS:
         raise OptionError("preset", name, ", ".join(PRESETS))
     return PRESETS[name]
+
+
+def presets_taking(light_balls: int) -> dict[str, Preset]:
+    """The presets that so many light balls can be added to: with any at all, those that end in a median."""
+    return {name: row for name, row in PRESETS.items() if row.rounds.ends_in_median or not light_balls}

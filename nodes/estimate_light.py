@@ -27,7 +27,7 @@ from ..dl_core.exposure import check_evs
 from ..dl_core.finished import FinishedBalls
 from ..dl_core.iterative import Rounds
 from ..dl_core.mending import estimate_mended, mending_remarks
-from ..dl_core.presets import PRESETS, Preset
+from ..dl_core.presets import PRESETS, Preset, presets_taking
 from ..dl_core.prompts import NEGATIVE_PROMPT
 from .confidence import CONFIDENCE_TOOLTIP
 from .depth_ball import depth_input, given, place_inputs
@@ -225,8 +225,7 @@ def _presets(
                 row.rounds, tolerance=tolerance or None, min_balls=min_balls, reject=reject, light_balls=light_balls
             ),
         )
-        for name, row in PRESETS.items()
-        if row.rounds.ends_in_median or not light_balls
+        for name, row in presets_taking(light_balls).items()
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import pytest
 
 from dl_core.bench.pareto.shipped_chart import chart_of, shipped_rows
 from dl_core.cli import main
+from dl_core.errors import OptionError
 from dl_core.iterative import Rounds
-from dl_core.presets import PRESETS
+from dl_core.presets import PRESETS, presets_taking
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -82,3 +84,15 @@ def test_a_measured_schedule_is_a_star_and_another_one_a_line() -> None:
 
 def shipped_error(name: str) -> float:
     return next(float(row["angular_error_deg"]) for row in shipped_rows() if row["schedule"] == name)
+
+
+def test_light_balls_are_for_presets_that_end_in_a_median() -> None:
+    assert presets_taking(0) == PRESETS
+    taking = presets_taking(5)
+    assert "paper" not in taking
+    for name, row in PRESETS.items():
+        if name in taking:
+            assert replace(row.rounds, light_balls=5).light_balls == 5
+        else:
+            with pytest.raises(OptionError, match="light_balls"):
+                replace(row.rounds, light_balls=5)

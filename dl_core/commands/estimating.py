@@ -29,7 +29,7 @@ from ..iterative import Rounds, Tally, tally_lines
 from ..mending import Mending, estimate_mended, mending_metadata, mending_remarks
 from ..painter import IMPUTINGS, Painter, SilentObserver
 from ..photo_exif import choose_fov, read_camera
-from ..presets import DEFAULT_PRESET, PRESETS, Preset, preset
+from ..presets import DEFAULT_PRESET, Preset, preset, presets_taking
 from ..shapes import Image
 from ..spheres import sphere_sheet
 
@@ -182,8 +182,7 @@ def _choose(args: argparse.Namespace, loaded: LoadedPainter) -> tuple[str, list[
     """The preset asked for, or the best one in the time budget, and what to say of it."""
     if args.budget is None:
         return args.preset or DEFAULT_PRESET, []
-    able = [name for name, row in PRESETS.items() if row.rounds.ends_in_median or not args.light_balls]
-    presets = {name: _preset(args, name) for name in able}
+    presets = {name: _preset(args, name) for name in presets_taking(args.light_balls)}
     choice = choose(args.budget, loaded.painter, loaded.canvas, args.diameter or loaded.diameter, presets)
     return choice.name, [choice.line(args.budget)]
 
