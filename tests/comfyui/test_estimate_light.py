@@ -253,7 +253,7 @@ def test_a_budget_replaces_the_preset_and_leaves_nothing_behind(
     presets = pack_module("dl_core.presets").PRESETS
     draft = replace(presets["draft"], error_deg=3.0)
     dear = replace(presets["paper"], error_deg=2.0, rounds=replace(presets["paper"].rounds, balls=1000, steps=998))
-    monkeypatch.setattr(pack_module("nodes.estimate_light"), "PRESETS", {"draft": draft, "paper": dear})
+    monkeypatch.setattr(pack_module("dl_core.presets"), "PRESETS", {"draft": draft, "paper": dear})
     forget()
     whole(node, graph, preset="draft", cfg=1.0)
     kept = pack_module("nodes.painting").FINISHED.bytes_held
