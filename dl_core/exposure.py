@@ -31,7 +31,6 @@ __all__ = [
     "clipping",
     "decode_display",
     "encode_display",
-    "evidence_floor",
     "expose",
     "exposure_error",
     "exposure_ratio",
@@ -65,10 +64,10 @@ TRUST: Final = 0.5
 DISTRUST: Final = 1.0
 """Scatter in stops from which it is not believed at all."""
 ONE_PICTURE: Final = 0.27
-"""Scatter in stops that one picture reaches when it is moved, bent or tinted: 0.26 at most over the misalignments of
-`lightprobe bench oracle`, other scenes' lights aside."""
+"""Scatter in stops that one picture reaches when it is moved, bent or tinted: 0.26 at most over the skies of
+`tests/test_bench_misalign.py`. This and the next were set where single balls of the mini model merge best."""
 TWO_PICTURES: Final = 0.33
-"""Scatter in stops from which exposures count as pictures of their own; the mini model's single balls have 0.3 to 1."""
+"""Scatter in stops from which exposures count as pictures of their own; most single balls of the mini model do."""
 
 
 def encode_display(radiance: Tensor, gamma: float = GAMMA) -> Tensor:
@@ -215,7 +214,7 @@ def _apart(compared: tuple[float, float] | None) -> float:
     return min(1.0, max(0.0, (scatter - ONE_PICTURE) / (TWO_PICTURES - ONE_PICTURE)))
 
 
-def evidence_floor(stops: float, gamma: float = GAMMA) -> float:
+def _evidence_floor(stops: float, gamma: float = GAMMA) -> float:
     """Linear value from which a picture is compared with one darker by some stops, whose codes are coarser."""
     return max(EVIDENCE_FLOOR, 2.0**stops * CLEAR_CODE**gamma)
 
@@ -230,7 +229,7 @@ def exposure_ratio(
     Returns:
         Median and median absolute deviation of the ratios, both in stops; None for fewer than 100 values to compare.
     """
-    known = (brighter >= evidence_floor(stops, gamma)) & (brighter < CLIP_THRESHOLD)
+    known = (brighter >= _evidence_floor(stops, gamma)) & (brighter < CLIP_THRESHOLD)
     if int(known.sum()) < EVIDENCE_COUNT:
         return None
     ratios = torch.log2(darker[known].clamp(min=1e-6) / brighter[known]) + stops
@@ -255,10 +254,11 @@ def borne_out(
 
     Returns:
         In (0, 1]; exactly 1 where the other channels agree within 0.05 stops, show less light, or tell nothing: those
-        that clip, and those below twice `evidence_floor`. What a channel shows itself does not enter its own share.
+        that clip, and those below twice the floor of `exposure_ratio`. What a channel shows itself does not enter its
+        own share.
     """
     # Single pixels are compared, so both exposures' codes have to agree within the dead zone.
-    floor = 2 * evidence_floor(stops, gamma)
+    floor = 2 * _evidence_floor(stops, gamma)
     known = (1 - clipping(brighter)) * (brighter / floor - 1).clamp(0, 1)
     weights = known * brighter
     excess = torch.log2(darker.clamp(min=1e-6) / brighter.clamp(min=1e-6))
@@ -317,8 +317,10 @@ def merge_robust(balls: Sequence[Tensor], evs: Sequence[float], gamma: float = G
         shown, stops = linear[i], evs[i] - evs[i + 1]
         compared = exposure_ratio(shown, linear[i + 1], stops, gamma)
         darker = merged * 2.0 ** (stops - _believed_error(compared))
-        share = borne_out(shown, darker, stops, gamma) ** _apart(compared)
-        merged = shown + clipping(shown) * (share * darker - shown).clamp(min=0)
+        apart = _apart(compared)
+        if apart:
+            darker = darker * borne_out(shown, darker, stops, gamma) ** apart
+        merged = shown + clipping(shown) * (darker - shown).clamp(min=0)
     return merged
 
 

@@ -25,17 +25,20 @@ def panorama(tmp_path: Path) -> Path:
     return write_exr(tmp_path / "sun.exr", light[0], metadata={}, half=False)
 
 
-@pytest.mark.parametrize(("option", "noise"), [("front", 0.2), ("level", 0.05)])
-def test_options_gain_on_noisy_balls(panorama: Path, option: str, noise: float) -> None:
-    """Levelling moves lights, and needs them: with more noise the merge holds them back, levelled or not."""
+@pytest.mark.parametrize(
+    ("option", "noise", "share"), [("front", 0.2, 0.5), ("level", 0.05, 0.75), ("level", 0.2, 0.9)]
+)
+def test_options_gain_on_noisy_balls(panorama: Path, option: str, noise: float, share: float) -> None:
+    """Levelling moves lights, and needs them. At a noise of 0.2 the merge holds lights back: before it did, this asked
+    for 0.75 there as well, and si-RMSE was lower with and without levelling."""
     studio = Studio(lambda variant, shot: AnalyticPainter(shot.truth_hdr, Flaws(noise=noise)), 128, 64)
     settings = Settings(Rounds(balls=1, rounds=0, steps=4), (0.0, -2.5))
     settings = replace(settings, canvas=studio.canvas, diameter=studio.diameter)
     for row in bench_mend([panorama], studio, settings, option):
         if option == "level":
-            assert row["si_rmse_with"] < 0.75 * row["si_rmse_without"]
+            assert row["si_rmse_with"] < share * row["si_rmse_without"]
             continue
-        assert row["visible_rmse_with"] < 0.5 * row["visible_rmse_without"]
+        assert row["visible_rmse_with"] < share * row["visible_rmse_without"]
         for key in ("map_rmse", "map_stops", "rmse", "angular_error_deg"):
             assert row[f"{key}_with"] < row[f"{key}_without"]
 
